@@ -1,0 +1,73 @@
+# Everything a person needs: `make demo` shows it, `make test` proves it.
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+.PHONY: help demo test test-all fast lint type bench docs build clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+# Two workers are enough to hide one slow test; `make test WORKERS=8` uses more.
+WORKERS ?= auto
+# The first Python that is new enough; `make PYTHON=/path/to/python3.12 ...` names another.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && command -v $$p && break; done)
+# One thread for each process: the matrices are small, and tests run side by side.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+help: ## show this
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+demo: $(VENV)/.has-video ## climb a box: plan, physics, pictures and video, into runs/climb
+	@$(BIN)/clamber climb --video
+
+test: $(VENV)/.has-video $(VENV)/.has-test ## every test but the slow ones
+	$(BIN)/python -m pytest -m "not slow and not gpu and not network" -n $(WORKERS)
+
+test-all: $(VENV)/.has-video $(VENV)/.has-test ## the slow tests too: whole climbs in physics
+	$(BIN)/python -m pytest -m "not gpu and not network" -n $(WORKERS)
+
+fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then what failed last, stops at the first failure
+	@$(BIN)/ruff check --quiet .
+	$(BIN)/python -m pytest -q -x --last-failed --last-failed-no-failures all \
+		-m "not slow and not gpu and not network and not compare"
+
+lint: $(VENV)/.has-dev ## ruff: rules and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+type: $(VENV)/.has-video $(VENV)/.has-dev ## pyright on src
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same jobs in other libraries
+	@for f in benchmarks/*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
+
+docs: $(VENV)/.has-docs ## the documentation as a web site, into site/
+	$(BIN)/mkdocs build --strict --quiet
+	@echo "open site/index.html"
+
+build: $(VENV)/.has-dev ## wheel and sdist into dist/, tried out in an empty environment
+	rm -rf dist build/empty
+	$(BIN)/python -m build --outdir dist .
+	$(PYTHON) -m venv build/empty
+	build/empty/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	cd build && ./empty/bin/clamber --version
+	cd build && ./empty/bin/python -c 'import clamber; clamber.load_demo("climb"); clamber.load_robot("coman")'
+	rm -rf build/empty
+
+clean: ## remove what make has made, but no runs
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache
+
+# A stamp for each extra that is installed: nothing is fetched twice, so make works offline afterwards.
+$(VENV)/.has-%: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing clamber[$*] into $(VENV) ..."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
+	@touch $@
+
+$(BIN)/python:
+	@if [ -z "$(PYTHON)" ]; then \
+		echo "clamber needs Python 3.11 or newer and found none: install one, or name it with make PYTHON=/path/to/python3.11" >&2; exit 1; fi
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+		echo "$(PYTHON) cannot make a virtual environment: install python3-venv (Debian, Ubuntu), or name another with make PYTHON=..." >&2; exit 1; }
+	@"$(PYTHON)" -m venv $(VENV)

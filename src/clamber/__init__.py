@@ -1,0 +1,60 @@
+"""One recording of a person climbing over a box, made into a motion of a humanoid.
+
+The public names are found in their modules on first use (PEP 562), so that importing
+the package costs nothing; `__init__.pyi` tells type checkers the same.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "ClamberError": "errors",
+    "Contact": "contact",
+    "ContactSequence": "contact",
+    "Demonstration": "demo",
+    "Infeasible": "errors",
+    "InputError": "errors",
+    "MissingDependency": "errors",
+    "Plan": "pipeline",
+    "PlanOptions": "pipeline",
+    "Robot": "model",
+    "Rollout": "simulation",
+    "Scene": "scene",
+    "Stance": "contact",
+    "Status": "errors",
+    "Support": "scene",
+    "Verdict": "simulation",
+    "detect_contacts": "detect",
+    "judge": "simulation",
+    "load_demo": "demo",
+    "load_plan": "io",
+    "load_robot": "model",
+    "load_scene": "scene",
+    "load_sequence": "io",
+    "plan": "pipeline",
+    "render_run": "viz",
+    "save_plan": "io",
+    "save_rollout": "io",
+    "save_sequence": "io",
+    "save_verdict": "io",
+    "simulate": "simulation",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> object:
+    """Import the module that has the name, once."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'clamber' has no attribute {name!r}")
+    value = getattr(import_module(f"clamber.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Names that `dir` and completion show."""
+    return sorted(__all__)
