@@ -1,0 +1,765 @@
+"""Robot and world: one MuJoCo model serves planning and physics.
+
+A `Robot` is a description (MJCF or URDF) with what a planner must know beyond it: which
+geoms are surfaces, which chain is a limb, where it stands at the start. `World` is robot
+and scene compiled together; `Kinematics` is a configuration of it for which forward
+kinematics have been run.
+
+Shapes: nq, nv of the world's model; na actuated joints; the first 7 of `q` and 6 of `v`
+are the floating base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+import pydantic
+
+from clamber.errors import InputError
+from clamber.scene import GROUND, Scene, Support, input_error, read_yaml
+from clamber.se3 import matrix_from_quat, rotation_vector
+
+ROBOTS = Path(__file__).parent / "robots"
+LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
+PHYSICS_STEP = 0.001  # [s]
+SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
+IMPRATIO = 10.0  # friction stiffer than normal force: no creep while standing
+DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
+DEFAULT_DAMPING = 3.0  # [N m s/rad] where the description has none
+
+
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+
+class LimbFile(_Strict):
+    """One of `limbs` of a robot file: landmarks are bodies, else geoms."""
+
+    root: str
+    middle: str
+    end: str
+    surfaces: list[str]
+
+
+class GainsFile(_Strict):
+    """Joint gains: [N m/rad], [N m s/rad], [N m/(rad s)]."""
+
+    kp: float = pydantic.Field(600.0, gt=0)
+    kd: float = pydantic.Field(20.0, ge=0)
+    ki: float = pydantic.Field(9.0, ge=0)
+
+
+class RobotFile(_Strict):
+    """A robot as a person writes it (`robot.yaml`)."""
+
+    version: int = 1
+    name: str
+    model: str
+    base: str
+    home: dict[str, float] = {}
+    limbs: dict[Literal["left_arm", "right_arm", "left_leg", "right_leg"], LimbFile]
+    surfaces: dict[str, str] = {}
+    gains: dict[str, GainsFile] = {"default": GainsFile()}
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Limb:
+    """A chain with its surfaces; `root` is the mass that its contacts support."""
+
+    name: str
+    root: str
+    middle: str
+    end: str
+    surfaces: tuple[str, ...]
+
+    @property
+    def is_arm(self) -> bool:
+        """Arms carry the shoulders, legs the hips."""
+        return self.name.endswith("arm")
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Robot:
+    """A humanoid as its files describe it.
+
+    Attributes:
+        path: The MJCF or URDF file.
+        base: Name of the pelvis body.
+        home: Joint angles of the posture it starts from [rad].
+        limbs: By name, from `LIMBS`.
+        prefixes: Prefix of the geom names of each surface.
+        gains: (kp, kd, ki) by joint name, and `default`.
+    """
+
+    name: str
+    path: Path
+    base: str
+    home: Mapping[str, float]
+    limbs: Mapping[str, Limb]
+    prefixes: Mapping[str, str]
+    gains: Mapping[str, tuple[float, float, float]]
+
+    @property
+    def surfaces(self) -> tuple[str, ...]:
+        """Names of all surfaces, limb by limb."""
+        return tuple(s for limb in self.limbs.values() for s in limb.surfaces)
+
+    def limb_of(self, surface: str) -> Limb:
+        """The limb that bears a surface."""
+        for limb in self.limbs.values():
+            if surface in limb.surfaces:
+                return limb
+        raise KeyError(f"no surface {surface!r}; there are {list(self.surfaces)}")
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Read a built-in robot by name, or a `robot.yaml`.
+
+    Raises:
+        InputError: No such robot, or a field of its file cannot be used.
+    """
+    path = Path(name_or_path)
+    if not path.suffix:
+        known = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))
+        if str(name_or_path) not in known:
+            raise InputError(
+                f"a robot.yaml, or one of {', '.join(known)}",
+                source="--robot",
+                value=str(name_or_path),
+            )
+        path = ROBOTS / str(name_or_path) / "robot.yaml"
+    elif path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            "a robot.yaml beside the model, which names its limbs and surfaces",
+            source="--robot",
+            value=str(path),
+        )
+    try:
+        file = RobotFile.model_validate(read_yaml(path))
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    missing = set(LIMBS) - set(file.limbs)
+    if missing:
+        raise InputError("all four limbs", source=path, field="limbs", value=sorted(missing))
+    model_path = path.parent / file.model
+    if not model_path.is_file():
+        raise InputError("an MJCF or URDF file", source=path, field="model", value=file.model)
+    limbs = {
+        n: Limb(name=n, root=f.root, middle=f.middle, end=f.end, surfaces=tuple(f.surfaces))
+        for n in LIMBS
+        for f in (file.limbs[n],)
+    }
+    gains = {"default": GainsFile(), **file.gains}
+    robot = Robot(
+        name=file.name,
+        path=model_path,
+        base=file.base,
+        home=dict(file.home),
+        limbs=limbs,
+        prefixes={s: file.surfaces.get(s, s) for limb in limbs.values() for s in limb.surfaces},
+        gains={n: (g.kp, g.kd, g.ki) for n, g in gains.items()},
+    )
+    _check(robot, path)
+    return robot
+
+
+def _check(robot: Robot, source: Path) -> None:
+    """Compile the robot alone and look up every name that its file mentions."""
+    try:
+        model = mujoco.MjSpec.from_file(str(robot.path)).compile()
+    except ValueError as e:
+        raise InputError(f"a model that MuJoCo loads ({e})", source=robot.path) from e
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    geoms = {model.geom(i).name for i in range(model.ngeom)}
+    joints = {model.joint(i).name for i in range(model.njnt)}
+    if robot.base not in bodies:
+        raise InputError(f"a body of {robot.path.name}", source=source, field="base", value=robot.base)
+    for name in robot.home:
+        if name not in joints:
+            raise InputError(f"a joint of {robot.path.name}", source=source, field="home", value=name)
+    for limb in robot.limbs.values():
+        for field in ("root", "middle", "end"):
+            if getattr(limb, field) not in bodies | geoms:
+                raise InputError(
+                    f"a body or geom of {robot.path.name}",
+                    source=source,
+                    field=f"limbs.{limb.name}.{field}",
+                    value=getattr(limb, field),
+                )
+        for s in limb.surfaces:
+            if not any(_bears(g, robot.prefixes[s]) for g in geoms):
+                raise InputError(
+                    f"geoms of {robot.path.name} named {robot.prefixes[s]!r} or {robot.prefixes[s] + '_...'!r}",
+                    source=source,
+                    field=f"limbs.{limb.name}.surfaces",
+                    value=s,
+                )
+
+
+def _bears(geom: str, prefix: str) -> bool:
+    return geom == prefix or geom.startswith(prefix + "_")
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Surface:
+    """Contact geometry of a surface, in the frame of its one body.
+
+    Attributes:
+        body: Body id.
+        geoms: Ids of all its geoms.
+        centre: (3,) point surface: centre of the ball; flat one: middle of the face.
+        radius: Radius of the ball; 0 for a flat surface.
+        rotation: (3, 3) R_BC of a flat surface in contact: z into the link, x along its
+            length; None for a point surface.
+        corners: (K, 3) points that can bear force (K = 1 or 4), ball centres or corners.
+    """
+
+    name: str
+    body: int
+    geoms: tuple[int, ...]
+    centre: np.ndarray
+    radius: float
+    rotation: np.ndarray | None
+    corners: np.ndarray
+
+    @property
+    def is_flat(self) -> bool:
+        """A flat surface fixes orientation, a point surface does not."""
+        return self.rotation is not None
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class World:
+    """Robot and scene as one compiled model, with indices and limits.
+
+    Attributes:
+        xml: The MJCF text, geoms of surfaces renamed to begin with the surface's name.
+        home: (nq,) standing at the scene's start, soles on the ground.
+        q_min, q_max: (nv,) joint limits aligned with `v`; infinite for the base.
+        v_max: (nv,) speed limits; infinite for the base.
+        tau_max: (na,) effort limits; joints: (na,) names.
+        qadr, dadr: (na,) indices of the actuated joints in q and v.
+        pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
+    """
+
+    model: mujoco.MjModel
+    xml: str
+    assets: Mapping[str, bytes]
+    robot: Robot
+    scene: Scene
+    home: np.ndarray
+    surfaces: Mapping[str, Surface]
+    joints: tuple[str, ...]
+    qadr: np.ndarray
+    dadr: np.ndarray
+    q_min: np.ndarray
+    q_max: np.ndarray
+    tau_max: np.ndarray
+    v_max: np.ndarray
+    kp: np.ndarray
+    kd: np.ndarray
+    ki: np.ndarray
+    pairs: np.ndarray
+    support_geom: Mapping[str, int]
+    supports: Mapping[str, Support]
+    base: int
+    mass: float
+
+    def landmark(self, name: str) -> tuple[int, np.ndarray]:
+        """Body id and point (3,) in its frame of a body or, failing that, a geom."""
+        b = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
+        if b >= 0:
+            return b, np.zeros(3)
+        if name in self.surfaces:
+            return self.surfaces[name].body, self.surfaces[name].centre
+        g = self.model.geom(name).id
+        return int(self.model.geom_bodyid[g]), self.model.geom_pos[g].copy()
+
+
+def build_world(robot: Robot, scene: Scene) -> World:
+    """Compile robot and scene into one model, the robot standing at the start.
+
+    Actuators of the description are replaced by one joint servo per hinge, saturated at
+    its effort limit. Supports have contact priority, so that their friction counts.
+    """
+    spec = mujoco.MjSpec.from_file(str(robot.path))
+    _prepare_robot(spec, robot)
+    spec.option.timestep = PHYSICS_STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = IMPRATIO
+    spec.option.gravity = [0, 0, -9.81]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.quality.shadowsize = 4096
+    _add_scene(spec, scene)
+    model = spec.compile()
+    xml = spec.to_xml()
+    return _index(model, xml, robot, scene)
+
+
+def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Free joint at the pelvis, servos on the hinges, surfaces' geoms by their names."""
+    for a in list(spec.actuators):
+        spec.delete(a)
+    for k in list(spec.keys):
+        spec.delete(k)
+    base = spec.body(robot.base)
+    if not any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in base.joints):
+        base.add_freejoint(name="root")
+    for g in spec.geoms:
+        for surface, prefix in robot.prefixes.items():
+            if prefix != surface and _bears(g.name, prefix):
+                g.name = surface + g.name.removeprefix(prefix)
+                break
+    for j in spec.joints:
+        if j.type != mujoco.mjtJoint.mjJNT_HINGE:
+            continue
+        if np.max(j.armature) <= 0:
+            j.armature = DEFAULT_ARMATURE
+        if np.max(j.damping) <= 0:
+            j.damping = [DEFAULT_DAMPING, 0, 0]
+        kp, kd, _ = robot.gains.get(j.name, robot.gains["default"])
+        a = spec.add_actuator(name=j.name, target=j.name)
+        a.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        a.set_to_position(kp=kp, kv=kd)
+        limit = float(np.max(np.abs(j.actfrcrange)))
+        a.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        a.forcerange = [-limit, limit]
+
+
+def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
+    """Ground plane, boxes and lights."""
+    spec.add_texture(
+        name="clamber_ground",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        width=256,
+        height=256,
+        rgb1=[0.86, 0.87, 0.88],
+        rgb2=[0.80, 0.81, 0.83],
+    )
+    material = spec.add_material(name="clamber_ground", texrepeat=[2, 2], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "clamber_ground"
+    spec.add_texture(
+        name="clamber_sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=128,
+        height=768,
+        rgb1=[0.93, 0.95, 0.97],
+        rgb2=[0.75, 0.80, 0.86],
+    )
+    world = spec.worldbody
+    light = world.add_light(pos=[-1.0, -2.0, 4.0], dir=[0.35, 0.5, -1.0], castshadow=True)
+    light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    light.diffuse = [0.6, 0.6, 0.6]
+    common = {"priority": 1, "solref": [*SOLREF], "condim": 4}
+    world.add_geom(
+        name=GROUND,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        friction=[scene.ground_friction, 0.02, 0.001],
+        material="clamber_ground",
+        **common,
+    )
+    for b in scene.boxes:
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(b.rotation).ravel())
+        world.add_geom(
+            name=b.name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=b.size / 2,
+            pos=b.position,
+            quat=quat,
+            friction=[b.friction, 0.02, 0.001],
+            rgba=[0.76, 0.60, 0.42, 1.0],
+            **common,
+        )
+
+
+def _index(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World:
+    """Look everything up once."""
+    base = model.body(robot.base).id
+    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    qadr, dadr = model.jnt_qposadr[hinges].copy(), model.jnt_dofadr[hinges].copy()
+    q_min, q_max = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    for j in hinges:
+        if model.jnt_limited[j]:
+            q_min[model.jnt_dofadr[j]], q_max[model.jnt_dofadr[j]] = model.jnt_range[j]
+    joints = tuple(model.joint(j).name for j in hinges)
+    tau_max = np.array([model.actuator(n).forcerange[1] for n in joints])
+    gains = np.array([robot.gains.get(n, robot.gains["default"]) for n in joints])
+    data = mujoco.MjData(model)
+    home = model.qpos0.copy()
+    for name, angle in robot.home.items():
+        home[model.joint(name).qposadr[0]] = angle
+    data.qpos[:] = home
+    mujoco.mj_kinematics(model, data)
+    surfaces = {s: _surface(model, data, s) for s in robot.surfaces}
+    home = _stand(model, data, robot, scene, home, surfaces)
+    return World(
+        model=model,
+        xml=xml,
+        assets={},
+        robot=robot,
+        scene=scene,
+        home=home,
+        surfaces=surfaces,
+        joints=joints,
+        qadr=qadr,
+        dadr=dadr,
+        q_min=q_min,
+        q_max=q_max,
+        tau_max=tau_max,
+        v_max=np.full(model.nv, np.inf),
+        kp=gains[:, 0],
+        kd=gains[:, 1],
+        ki=gains[:, 2],
+        pairs=_pairs(model, data, base),
+        support_geom={s.name: model.geom(s.name).id for s in scene.supports},
+        supports={s.name: s for s in scene.supports},
+        base=base,
+        mass=float(model.body_subtreemass[base]),
+    )
+
+
+def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
+    """Contact geometry from the geoms that bear the surface's name.
+
+    The geom with the bare name (else the first) is the one that plans: a sphere is a
+    point surface, a capsule one at its lower end, a box or any other a flat surface, its
+    face the one that looks down at home.
+    """
+    geoms = [g for g in range(model.ngeom) if _bears(model.geom(g).name, name)]
+    main = next((g for g in geoms if model.geom(g).name == name), geoms[0])
+    body = int(model.geom_bodyid[main])
+    bodies = {int(model.geom_bodyid[g]) for g in geoms}
+    if len(bodies) > 1:
+        raise InputError("one body for each surface", field=name, value=sorted(model.body(b).name for b in bodies))
+    kind, size = mujoco.mjtGeom(int(model.geom_type[main])), model.geom_size[main]
+    p_BG, R_BG = model.geom_pos[main].copy(), matrix_from_quat(model.geom_quat[main])
+    R_WB = data.xmat[body].reshape(3, 3)
+    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            ends = p_BG + np.outer([-1.0, 1.0], R_BG[:, 2] * size[1])
+            p_BG = ends[np.argmin((ends @ R_WB.T)[:, 2])]
+        return Surface(
+            name=name,
+            body=body,
+            geoms=tuple(geoms),
+            centre=p_BG,
+            radius=float(size[0]),
+            rotation=None,
+            corners=p_BG[None],
+        )
+    if kind != mujoco.mjtGeom.mjGEOM_BOX:
+        p_BG = p_BG + R_BG @ model.geom_aabb[main, :3]
+        size = model.geom_aabb[main, 3:]
+    down = (R_WB @ R_BG)[2]  # world's z in the geom's frame
+    axis = int(np.argmax(np.abs(down)))
+    sign = -np.sign(down[axis])  # the outward face looks down
+    normal = np.zeros(3)
+    normal[axis] = -sign
+    rest = [i for i in range(3) if i != axis]
+    length = max(rest, key=lambda i: size[i])
+    x = np.zeros(3)
+    x[length] = np.sign((R_WB @ R_BG)[0, length]) or 1.0
+    R_GC = np.stack([x, np.cross(normal, x), normal], axis=1)
+    other = next(i for i in rest if i != length)
+    half = np.zeros(3)
+    half[axis] = sign * size[axis]
+    centre = p_BG + R_BG @ half
+    corners = []
+    for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+        offset = half.copy()
+        offset[length], offset[other] = a * size[length], b * size[other]
+        corners.append(p_BG + R_BG @ offset)
+    return Surface(
+        name=name,
+        body=body,
+        geoms=tuple(geoms),
+        centre=centre,
+        radius=0.0,
+        rotation=R_BG @ R_GC,
+        corners=np.array(corners),
+    )
+
+
+def _stand(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    robot: Robot,
+    scene: Scene,
+    home: np.ndarray,
+    surfaces: Mapping[str, Surface],
+) -> np.ndarray:
+    """Move the base so that the ankles' midpoint is at the start and the soles at z = 0."""
+    ends = [robot.limbs[n].end for n in ("left_leg", "right_leg")]
+    low, ankles = np.inf, []
+    for name in ends:
+        b = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+        ankles.append(data.xpos[b] if b >= 0 else data.geom(name).xpos)
+    for s in surfaces.values():
+        z = data.xpos[s.body] + s.corners @ data.xmat[s.body].reshape(3, 3).T
+        low = min(low, float(z[:, 2].min() - s.radius))
+    x, y, yaw = scene.start
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    mid = np.mean(ankles, axis=0)
+    out = home.copy()
+    out[:3] = R @ (home[:3] - [mid[0], mid[1], low]) + [x, y, 0.0]
+    turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    mujoco.mju_mulQuat(out[3:7], turn, home[3:7])
+    return out
+
+
+def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
+    """Geom pairs whose contacts MuJoCo would compute and that are apart at home."""
+    robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[base]
+    excluded = set(model.exclude_signature.tolist())
+    fromto = np.zeros(6)
+    out = []
+    for a in range(model.ngeom):
+        for b in range(a + 1, model.ngeom):
+            if not (robot[a] or robot[b]):
+                continue
+            masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
+                model.geom_contype[b] & model.geom_conaffinity[a]
+            )
+            ba, bb = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+            wa, wb = int(model.body_weldid[ba]), int(model.body_weldid[bb])
+            if not masks or wa == wb:
+                continue
+            if robot[a] and robot[b]:
+                parents = (model.body_weldid[model.body_parentid[wa]], model.body_weldid[model.body_parentid[wb]])
+                if wb == parents[0] or wa == parents[1]:
+                    continue
+                lo, hi = min(ba, bb), max(ba, bb)
+                if (lo << 16) + hi in excluded or (hi << 16) + lo in excluded:
+                    continue
+                if mujoco.mj_geomDistance(model, data, a, b, 1.0, fromto) <= 0:
+                    continue
+            out.append((a, b))
+    return np.array(out, dtype=np.int32).reshape(-1, 2)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Proximity:
+    """Pairs nearer than the range asked for.
+
+    Attributes:
+        pairs: (m,) indices into `World.pairs`.
+        distance: (m,) signed [m].
+        normal: (m, 3) from the first geom to the second.
+        first, second: (m, 3) nearest points in the world.
+    """
+
+    pairs: np.ndarray
+    distance: np.ndarray
+    normal: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+
+class Kinematics:
+    """A configuration of a world for which forward kinematics have been run.
+
+    The object is a workspace: `update` overwrites it. Jacobians are (3, nv), linear
+    velocity of a point in the world.
+    """
+
+    def __init__(self, world: World) -> None:
+        """Allocate once; `update` fills."""
+        m = world.model
+        self.world = world
+        self.data = mujoco.MjData(m)
+        self._jacp = np.zeros((3, m.nv))
+        self._jacr = np.zeros((3, m.nv))
+        self._fromto = np.zeros(6)
+        first, second = world.pairs.T
+        self._first, self._second = first, second
+        radius = m.geom_rbound.copy()
+        self._plane = m.geom_type[first] == mujoco.mjtGeom.mjGEOM_PLANE
+        self._plane2 = m.geom_type[second] == mujoco.mjtGeom.mjGEOM_PLANE
+        self._reach = radius[first] + radius[second]
+        self._plane_any = np.flatnonzero(self._plane | self._plane2)
+        box = m.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+        static = m.body_weldid[m.geom_bodyid] == 0
+        self._box_first = np.flatnonzero(box[first] & static[first] & ~self._plane)
+        self._box_second = np.flatnonzero(box[second] & static[second] & ~self._plane2)
+        self._radius = radius
+        self._landmarks: dict[str, tuple[int, np.ndarray]] = {}
+
+    def update(self, q: np.ndarray) -> None:
+        """Run forward kinematics for `q` (nq,)."""
+        d, m = self.data, self.world.model
+        d.qpos[:] = q
+        mujoco.mj_kinematics(m, d)
+        mujoco.mj_comPos(m, d)
+
+    @property
+    def q(self) -> np.ndarray:
+        """(nq,) a copy of the configuration."""
+        return self.data.qpos.copy()
+
+    @property
+    def com(self) -> np.ndarray:
+        """(3,) centre of mass of the robot in the world."""
+        return self.data.subtree_com[self.world.base]
+
+    def com_jacobian(self) -> np.ndarray:
+        """(3, nv), valid until the next call."""
+        mujoco.mj_jacSubtreeCom(self.world.model, self.data, self._jacp, self.world.base)
+        return self._jacp
+
+    def rotation(self, body: int) -> np.ndarray:
+        """(3, 3) R_WB."""
+        return self.data.xmat[body].reshape(3, 3)
+
+    def point(self, body: int, p_B: np.ndarray) -> np.ndarray:
+        """(..., 3) world position of points (..., 3) of a body."""
+        return self.data.xpos[body] + p_B @ self.data.xmat[body].reshape(3, 3).T
+
+    def point_jacobian(self, body: int, point: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """(3, nv) of the body's point that is at `point` in the world."""
+        jac = self._jacp if out is None else out
+        mujoco.mj_jac(self.world.model, self.data, jac, None, point, body)
+        return jac
+
+    def jacobians(self, body: int, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Linear and angular Jacobian, each (3, nv), valid until the next call."""
+        mujoco.mj_jac(self.world.model, self.data, self._jacp, self._jacr, point, body)
+        return self._jacp, self._jacr
+
+    def landmark(self, name: str) -> tuple[int, np.ndarray]:
+        """Body id and world position (3,) of a landmark."""
+        if name not in self._landmarks:
+            self._landmarks[name] = self.world.landmark(name)
+        body, p = self._landmarks[name]
+        return body, self.point(body, p)
+
+    def contact_point(self, surface: str, normal: np.ndarray) -> np.ndarray:
+        """(3,) the surface's point that touches a support with that normal."""
+        s = self.world.surfaces[surface]
+        return self.point(s.body, s.centre) - s.radius * normal
+
+    def bearing_points(self, surface: str, normal: np.ndarray) -> np.ndarray:
+        """(K, 3) the points that bear force on a support with that normal."""
+        s = self.world.surfaces[surface]
+        return self.point(s.body, s.corners) - s.radius * normal
+
+    def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
+        """(3,) world rotation vector from the surface's frame to the contact frame."""
+        s = self.world.surfaces[surface]
+        if s.rotation is None:
+            raise ValueError(f"{surface} is a point surface: it has no orientation")
+        return rotation_vector(R_WC @ (self.rotation(s.body) @ s.rotation).T)
+
+    def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
+        """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them."""
+        m, d = self.world.model, self.data
+        x = d.geom_xpos
+        gap = np.linalg.norm(x[self._first] - x[self._second], axis=1) - self._reach
+        k = self._plane_any
+        gap[k] = np.where(
+            self._plane[k],
+            x[self._second[k], 2] - x[self._first[k], 2] - self._radius[self._second[k]],
+            x[self._first[k], 2] - x[self._second[k], 2] - self._radius[self._first[k]],
+        )
+        for k, box, other in (
+            (self._box_first, self._first, self._second),
+            (self._box_second, self._second, self._first),
+        ):
+            if len(k) == 0:
+                continue
+            b, o = box[k], other[k]
+            R = d.geom_xmat[b].reshape(-1, 3, 3)
+            local = np.einsum("kij,ki->kj", R, x[o] - x[b])
+            outside = np.maximum(np.abs(local) - m.geom_size[b], 0.0)
+            gap[k] = np.linalg.norm(outside, axis=1) - self._radius[o]
+        near = gap < reach
+        if active is not None:
+            near &= active
+        idx = np.flatnonzero(near)
+        keep, dist, points = [], [], []
+        f = self._fromto
+        for i in idx:
+            s = mujoco.mj_geomDistance(m, d, int(self._first[i]), int(self._second[i]), reach, f)
+            if s < reach:
+                keep.append(i)
+                dist.append(s)
+                points.append(f.copy())
+        p = np.array(points).reshape(-1, 2, 3)
+        distance = np.array(dist)
+        delta = p[:, 1] - p[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normal = delta / distance[:, None]
+        bad = ~np.isfinite(normal).all(axis=1)
+        normal[bad] = 0.0
+        return Proximity(
+            pairs=np.array(keep, dtype=int),
+            distance=distance,
+            normal=normal,
+            first=p[:, 0],
+            second=p[:, 1],
+        )
+
+    def integrate(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """(nq,) `q` moved along the tangent vector `v` (nv,) for unit time."""
+        out = q.copy()
+        mujoco.mj_integratePos(self.world.model, out, v, 1.0)
+        return out
+
+    def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """(nv,) the tangent vector from `a` to `b`."""
+        out = np.zeros(self.world.model.nv)
+        mujoco.mj_differentiatePos(self.world.model, out, 1.0, a, b)
+        return out
+
+    def gravity(self) -> np.ndarray:
+        """(nv,) generalised gravity force that joints and contacts must balance."""
+        m, d = self.world.model, self.data
+        d.qvel[:] = 0.0
+        d.qacc[:] = 0.0
+        mujoco.mj_fwdPosition(m, d)
+        mujoco.mj_fwdVelocity(m, d)
+        return d.qfrc_bias.copy()
+
+
+def limb_lengths(kin: Kinematics) -> dict[str, float]:
+    """Segment lengths of the robot by the names of a subject's [m]."""
+    out = {}
+    for part, names in (
+        ("upper_arm", ("root", "middle")),
+        ("forearm", ("middle", "end")),
+        ("thigh", ("root", "middle")),
+        ("shank", ("middle", "end")),
+    ):
+        limbs = [x for x in kin.world.robot.limbs.values() if x.is_arm == (part in ("upper_arm", "forearm"))]
+        ends = [[kin.landmark(getattr(x, n))[1] for n in names] for x in limbs]
+        out[part] = float(np.mean([np.linalg.norm(b - a) for a, b in ends]))
+    return out
+
+
+def bearing_frames(kin: Kinematics, contacts: Sequence[tuple[str, str]]) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """Names, points (n, 3), normals (n, 3), friction (n,) of all bearing points.
+
+    Args:
+        kin: The configuration.
+        contacts: (surface, support) names.
+    """
+    names, points, normals, mu = [], [], [], []
+    for surface, support in contacts:
+        s = kin.world.supports[support]
+        p = kin.bearing_points(surface, s.normal)
+        names += [surface] * len(p)
+        points.append(p)
+        normals.append(np.tile(s.normal, (len(p), 1)))
+        mu += [s.friction] * len(p)
+    return names, np.concatenate(points), np.concatenate(normals), np.array(mu)

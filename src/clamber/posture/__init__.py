@@ -1,0 +1,1 @@
+"""Stance and demonstrated posture -> stable posture."""

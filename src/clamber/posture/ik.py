@@ -1,0 +1,541 @@
+"""Whole-body inverse kinematics: a sequence of QPs with hard and soft tasks.
+
+At a configuration q, with the step `dq` in the tangent space as the variable,
+
+    min   1/2 sum_k w_k^2 || J_k dq + e_k ||^2 + 1/2 mu || dq ||^2      soft tasks
+    s.t.  J_c dq = -e_c                                                 contacts
+          max(-step, q_min - q) <= dq <= min(step, q_max - q)           joints
+          A (p_G + J_G dq) <= b - margin                                balance
+          d_i + n_i' (J_2 - J_1) dq >= clearance_i                      distances
+
+then q <- q (+) dq. Contacts and joint limits are hard; balance and distances are
+softened by the solver with a weight of 1e6, so that they give way by micrometres, or
+visibly where nothing satisfies them: `residuals` tells, without the solver.
+
+Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import daqp
+import numpy as np
+
+from clamber.errors import Status
+from clamber.model import Kinematics, World
+from clamber.scene import Support
+from clamber.se3 import frame_from_normal, matrix_from_quat, rotation_vector
+from clamber.statics import com_margin, polygon_halfplanes, support_ellipse, support_polygon
+
+STEP_ROTATION = 0.15  # [rad] largest joint step of one iteration
+STEP_TRANSLATION = 0.08  # [m] largest step of the base
+CONTACT_STEP = 0.05  # [m, rad] largest contact error asked for in one iteration
+DISTANCE_STEP = 0.03  # [m] deepest recovery from a collision in one iteration
+ACTIVE_RANGE = 0.10  # [m] farther pairs have no row
+DAMPING = 2e-4  # mu
+CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
+DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
+BALANCE_TOL = 2e-3  # [m]
+EDGE_INSET = 0.005  # [m] contacts stay this far inside the support's border
+SOFT, EQUALITY = 8, 5  # daqp's constraint types
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ContactGoal:
+    """What a posture wants of one surface.
+
+    Attributes:
+        surface, support: Names.
+        position: (3,) where the contact holds (`free` False), or where it would be liked.
+        rotation: (3, 3) R_WC of a flat surface in contact.
+        free: The position along the support is left to the optimiser.
+        hard: In contact; False for a surface that moves there (a soft target in the air).
+        loaded: It may bear force, and counts for the support polygon.
+        stability: Weight of (4.25), the horizontal distance from the contact to the mass
+            it supports; only for free contacts.
+        reference: Weight of the distance to `position`; free contacts and moving ones.
+    """
+
+    surface: str
+    support: str
+    position: np.ndarray
+    rotation: np.ndarray
+    free: bool = False
+    hard: bool = True
+    loaded: bool = True
+    stability: float = 0.0
+    reference: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PostureProblem:
+    """All that a posture must and should satisfy; see the module docstring.
+
+    Attributes:
+        goals: Contacts and moving surfaces.
+        q_reference: (nq,) preferred posture; its weight acts on the joints alone.
+        directions: Unit vectors (3,) of body segments in the world, by name.
+        base_rotation: (3, 3) preferred R_WB of the pelvis, or None.
+        clearance: (P,) least distance of each pair [m]; -inf where a pair does not count.
+        balance: Keep the centre of mass over the loaded contacts.
+        balance_margin: [m] from the border of the support polygon.
+        posture_weight, direction_weight, base_weight, com_weight: Of the soft tasks.
+        ellipse_weight: Of holding the centre of mass in the support ellipse (4.28).
+        lean: (surface, unit vector (3,) from its contact to the mass it will support,
+            weight), the orientation of reach-to-support (4.27).
+    """
+
+    goals: tuple[ContactGoal, ...]
+    q_reference: np.ndarray
+    clearance: np.ndarray
+    directions: Mapping[str, np.ndarray] = field(default_factory=lambda: MappingProxyType({}))
+    base_rotation: np.ndarray | None = None
+    balance: bool = True
+    balance_margin: float = 0.025
+    posture_weight: float = 0.08
+    direction_weight: float = 0.0
+    base_weight: float = 0.15
+    com_weight: float = 0.3
+    ellipse_weight: float = 0.0
+    lean: tuple[str, np.ndarray, float] | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Residuals:
+    """How well a configuration satisfies a problem, computed without the solver.
+
+    Attributes:
+        contact: Largest distance or angle by which a hard contact is open [m, rad].
+        distance: Largest shortfall of a clearance [m]; 0 where all hold.
+        balance: Shortfall of the centre of mass's margin [m]; 0 where it holds.
+        limits: Largest joint-limit violation [rad].
+        worst_pair: Index into the world's pairs of the largest shortfall, -1 for none.
+        com_margin: Signed distance of the centre of mass to the polygon's border [m].
+    """
+
+    contact: float
+    distance: float
+    balance: float
+    limits: float
+    worst_pair: int
+    com_margin: float
+
+    @property
+    def status(self) -> Status:
+        """The first thing that is wrong, or SOLVED."""
+        if self.contact > CONTACT_TOL or self.limits > 1e-6:
+            return Status.UNREACHABLE
+        if self.distance > DISTANCE_TOL:
+            return Status.COLLIDING
+        if self.balance > BALANCE_TOL:
+            return Status.UNBALANCED
+        return Status.SOLVED
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Solution:
+    """A configuration, how it was found and how good it is.
+
+    Attributes:
+        q: (nq,).
+        iterations: QPs solved.
+        residuals: Recomputed at `q`.
+        converged: The last step was small.
+    """
+
+    q: np.ndarray
+    iterations: int
+    residuals: Residuals
+    converged: bool
+
+    @property
+    def status(self) -> Status:
+        """SOLVED, or the first thing that is wrong."""
+        return self.residuals.status
+
+
+# Body segments by name: (limb, from, to); the trunk is the mean of hips and shoulders.
+_SEGMENTS = {
+    f"{side}_{part}": (f"{side}_{limb}", a, b)
+    for side in ("left", "right")
+    for part, limb, a, b in (
+        ("upper_arm", "arm", "root", "middle"),
+        ("forearm", "arm", "middle", "end"),
+        ("thigh", "leg", "root", "middle"),
+        ("shank", "leg", "middle", "end"),
+    )
+}
+
+
+def base_clearance(world: World, margin: float) -> np.ndarray:
+    """(P,) the same clearance [m] for every pair."""
+    return np.full(len(world.pairs), margin)
+
+
+def contact_clearance(
+    world: World, clearance: np.ndarray, contacts: Mapping[str, str]
+) -> np.ndarray:
+    """Let surfaces touch the supports they stand on.
+
+    Args:
+        world: Robot and scene.
+        clearance: (P,) to start from.
+        contacts: Support by surface.
+
+    Returns:
+        (P,): the planning geom of a contact pair is left to the contact task; further
+        geoms of the surface may touch but not enter.
+    """
+    out = clearance.copy()
+    name = world.model.geom
+    for surface, support in contacts.items():
+        s, g = world.surfaces[surface], world.support_geom[support]
+        mine = np.isin(world.pairs, s.geoms)
+        here = np.isin(world.pairs, [g]).any(axis=1) & mine.any(axis=1)
+        for i in np.flatnonzero(here):
+            a, b = world.pairs[i]
+            geom = int(a if b == g else b)
+            out[i] = -np.inf if name(geom).name == surface or s.is_flat else 0.0
+    return out
+
+
+class _Rows:
+    """Preallocated rows `J x (sense) b`, filled from the top."""
+
+    def __init__(self, capacity: int, nv: int) -> None:
+        self.J = np.zeros((capacity, nv))
+        self.lo = np.zeros(capacity)
+        self.hi = np.zeros(capacity)
+        self.n = 0
+
+    def take(self, m: int) -> slice:
+        if self.n + m > len(self.J):
+            grow = max(len(self.J), m)
+            self.J = np.concatenate([self.J, np.zeros((grow, self.J.shape[1]))])
+            self.lo = np.concatenate([self.lo, np.zeros(grow)])
+            self.hi = np.concatenate([self.hi, np.zeros(grow)])
+        s = slice(self.n, self.n + m)
+        self.n += m
+        return s
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class QP:
+    """min 1/2 x'Hx + c'x with bounds on x first, then rows `lo <= A x <= hi`."""
+
+    H: np.ndarray
+    c: np.ndarray
+    A: np.ndarray
+    lo: np.ndarray
+    hi: np.ndarray
+    sense: np.ndarray
+
+
+class IK:
+    """Workspace of the solver: one per world, used again for every posture."""
+
+    def __init__(self, world: World) -> None:
+        """Allocate rows once."""
+        self.world = world
+        self.kin = Kinematics(world)
+        nv = world.model.nv
+        self._soft = _Rows(96, nv)
+        self._hard = _Rows(32, nv)
+        self._ineq = _Rows(96, nv)
+        self._jac = np.zeros((3, nv))
+        self._jac2 = np.zeros((3, nv))
+        self._step = np.full(nv, STEP_ROTATION)
+        self._step[:3] = STEP_TRANSLATION
+        joints = np.isfinite(world.q_min) | np.isfinite(world.q_max)
+        self._limited = np.flatnonzero(joints)
+        self._q_of_dof = np.full(nv, -1)
+        self._q_of_dof[world.dadr] = world.qadr
+        self._edges = {n: s.edges() for n, s in world.supports.items()}
+        self._geom_body = world.model.geom_bodyid
+
+    def build(self, problem: PostureProblem, q: np.ndarray) -> QP:
+        """The QP at `q`; `Kinematics` of this workspace is left at `q`."""
+        kin, w = self.kin, self.world
+        kin.update(q)
+        soft, hard, ineq = self._soft, self._hard, self._ineq
+        soft.n = hard.n = ineq.n = 0
+        for goal in problem.goals:
+            self._goal_rows(goal)
+        self._direction_rows(problem)
+        if problem.base_rotation is not None and problem.base_weight > 0:
+            self._base_rows(problem.base_rotation, problem.base_weight)
+        if problem.lean is not None:
+            self._lean_rows(*problem.lean)
+        if problem.balance:
+            self._balance_rows(problem)
+        self._distance_rows(problem.clearance)
+
+        nv = w.model.nv
+        J, e = soft.J[: soft.n], soft.lo[: soft.n]
+        H = J.T @ J
+        c = J.T @ e
+        diagonal = np.full(nv, DAMPING)
+        if problem.posture_weight > 0:
+            d = kin.difference(problem.q_reference, q)
+            weight = problem.posture_weight**2
+            c[w.dadr] += weight * d[w.dadr]
+            diagonal[w.dadr] += weight
+        H[np.diag_indices(nv)] += diagonal
+
+        lo, hi = -self._step.copy(), self._step.copy()
+        k = self._limited
+        now = q[self._q_of_dof[k]]
+        lo[k] = np.maximum(lo[k], w.q_min[k] - now)
+        hi[k] = np.minimum(hi[k], w.q_max[k] - now)
+        hi = np.maximum(hi, lo)
+        return QP(
+            H=H,
+            c=c,
+            A=np.concatenate([hard.J[: hard.n], ineq.J[: ineq.n]]),
+            lo=np.concatenate([lo, hard.lo[: hard.n], ineq.lo[: ineq.n]]),
+            hi=np.concatenate([hi, hard.lo[: hard.n], ineq.hi[: ineq.n]]),
+            sense=np.concatenate(
+                [np.zeros(nv, np.int32), np.full(hard.n, EQUALITY, np.int32), np.full(ineq.n, SOFT, np.int32)]
+            ),
+        )
+
+    def step(self, qp: QP) -> np.ndarray:
+        """Solve; contacts that contradict one another become soft, heavily weighted."""
+        x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, qp.hi, qp.lo, qp.sense)
+        if flag > 0:
+            return x
+        nv = len(qp.c)
+        m = int(np.count_nonzero(qp.sense == EQUALITY))
+        J, e = qp.A[:m], -qp.lo[nv : nv + m]
+        keep = np.r_[0:nv, nv + m : len(qp.lo)]
+        x, _, flag, _ = daqp.solve(
+            qp.H + 1e4 * J.T @ J,
+            qp.c + 1e4 * J.T @ e,
+            qp.A[m:],
+            qp.hi[keep],
+            qp.lo[keep],
+            qp.sense[keep],
+        )
+        return x if flag > 0 else np.zeros(nv)
+
+    def solve(
+        self,
+        problem: PostureProblem,
+        q: np.ndarray,
+        *,
+        iterations: int = 60,
+        tolerance: float = 2e-3,
+    ) -> Solution:
+        """Iterate from `q` until the step is below `tolerance` and all holds."""
+        n, converged = 0, False
+        for n in range(1, iterations + 1):
+            dq = self.step(self.build(problem, q))
+            q = self.kin.integrate(q, dq)
+            if np.abs(dq).max() < tolerance:
+                converged = True
+                break
+        return Solution(
+            q=q, iterations=n, residuals=self.residuals(problem, q), converged=converged
+        )
+
+    def residuals(self, problem: PostureProblem, q: np.ndarray) -> Residuals:
+        """Recompute everything from the model at `q`."""
+        kin, w = self.kin, self.world
+        kin.update(q)
+        contact = 0.0
+        for g in problem.goals:
+            if not g.hard:
+                continue
+            s, support = w.surfaces[g.surface], w.supports[g.support]
+            p = kin.contact_point(g.surface, support.normal)
+            if g.free:
+                error = abs(float(support.height(p)))
+                points = kin.bearing_points(g.surface, support.normal)
+                A, b = self._edges[g.support]
+                error = max(error, float((points @ A.T - b).max()))
+            else:
+                error = float(np.linalg.norm(p - g.position))
+            if s.is_flat:
+                turn = kin.flat_error(g.surface, g.rotation)
+                if g.free:
+                    turn = turn - support.normal * (turn @ support.normal)
+                error = max(error, float(np.linalg.norm(turn)))
+            contact = max(contact, error)
+        near = kin.proximity(0.02, np.isfinite(problem.clearance))
+        short = problem.clearance[near.pairs] - near.distance
+        worst = int(np.argmax(short)) if len(short) else -1
+        polygon = self._polygon(problem)
+        margin = com_margin(kin.com[:2], polygon) if len(polygon) else -np.inf
+        dof = w.dadr
+        over = np.maximum(w.q_min[dof] - q[w.qadr], q[w.qadr] - w.q_max[dof])
+        return Residuals(
+            contact=contact,
+            distance=max(float(short[worst]), 0.0) if worst >= 0 else 0.0,
+            balance=max(problem.balance_margin - margin, 0.0) if problem.balance else 0.0,
+            limits=max(float(over.max()), 0.0),
+            worst_pair=int(near.pairs[worst]) if worst >= 0 and short[worst] > 0 else -1,
+            com_margin=float(margin),
+        )
+
+    # Rows, one method for each kind of task.
+
+    def _goal_rows(self, g: ContactGoal) -> None:
+        kin = self.kin
+        s, support = self.world.surfaces[g.surface], self.world.supports[g.support]
+        n = support.normal
+        p = kin.contact_point(g.surface, n)
+        jac, rot = kin.jacobians(s.body, p)
+        if s.radius > 0:
+            # The touching point of a ball stays under its centre: it moves as that does.
+            jac = kin.point_jacobian(s.body, p + s.radius * n)
+        if not g.hard:
+            self._target(jac, p - g.position, g.reference)
+            if s.is_flat:
+                self._target(rot, -kin.flat_error(g.surface, g.rotation), 0.3 * g.reference)
+            return
+        if not g.free:
+            m = 6 if s.is_flat else 3
+            k = self._hard.take(m)
+            self._hard.J[k.start : k.start + 3] = jac
+            self._hard.lo[k.start : k.start + 3] = _clip(g.position - p)
+            if s.is_flat:
+                self._hard.J[k.start + 3 : k.stop] = rot
+                self._hard.lo[k.start + 3 : k.stop] = _clip(kin.flat_error(g.surface, g.rotation))
+            return
+        k = self._hard.take(3 if s.is_flat else 1)
+        self._hard.J[k.start] = n @ jac
+        self._hard.lo[k.start] = np.clip(-support.height(p), -CONTACT_STEP, CONTACT_STEP)
+        A, b = self._edges[g.support]
+        if s.is_flat:
+            turn = kin.flat_error(g.surface, g.rotation)
+            R = support.rotation
+            self._hard.J[k.start + 1 : k.stop] = R[:, :2].T @ rot
+            self._hard.lo[k.start + 1 : k.stop] = _clip(R[:, :2].T @ turn)
+            self._target(n[None] @ rot, -(n @ turn)[None], 0.3)
+            for corner in kin.bearing_points(g.surface, n):
+                self._inside(A, b, corner, kin.point_jacobian(s.body, corner))
+            jac = kin.point_jacobian(s.body, p)
+        else:
+            self._inside(A, b, p, jac)
+        T = support.rotation[:, :2].T
+        if g.reference > 0:
+            self._target(T @ jac, T @ (p - g.position), g.reference)
+        if g.stability > 0:
+            body, mass = kin.landmark(self.world.robot.limb_of(g.surface).root)
+            J = jac.copy()
+            J -= kin.point_jacobian(body, mass)
+            self._target(J[:2], (p - mass)[:2], np.sqrt(2.0 * g.stability))
+
+    def _inside(self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray) -> None:
+        room = b - EDGE_INSET - A @ p
+        near = room < 0.15
+        if not near.any():
+            return
+        k = self._ineq.take(int(near.sum()))
+        self._ineq.J[k] = A[near] @ jac
+        self._ineq.hi[k] = np.maximum(room[near], -CONTACT_STEP)
+        self._ineq.lo[k] = -1e30
+
+    def _target(self, J: np.ndarray, e: np.ndarray, weight: float) -> None:
+        k = self._soft.take(len(e))
+        self._soft.J[k] = weight * J
+        self._soft.lo[k] = weight * e
+
+    def _base_rows(self, R_WB: np.ndarray, weight: float) -> None:
+        w = self.world
+        _, rot = self.kin.jacobians(w.base, self.kin.data.xpos[w.base])
+        self._target(rot, -rotation_vector(R_WB @ self.kin.rotation(w.base).T), weight)
+
+    def _direction_rows(self, problem: PostureProblem) -> None:
+        if problem.direction_weight <= 0:
+            return
+        kin = self.kin
+        limbs = self.world.robot.limbs
+        for name, u in problem.directions.items():
+            if name == "trunk":
+                hips = [kin.landmark(limbs[n].root) for n in ("left_leg", "right_leg")]
+                tops = [kin.landmark(limbs[n].root) for n in ("left_arm", "right_arm")]
+                a = 0.5 * (hips[0][1] + hips[1][1])
+                b = 0.5 * (tops[0][1] + tops[1][1])
+                body_a, body_b = hips[0][0], tops[0][0]
+            else:
+                limb, first, second = _SEGMENTS[name]
+                body_a, a = kin.landmark(getattr(limbs[limb], first))
+                body_b, b = kin.landmark(getattr(limbs[limb], second))
+            length = float(np.linalg.norm(b - a))
+            kin.point_jacobian(body_b, b, self._jac)
+            kin.point_jacobian(body_a, a, self._jac2)
+            self._target((self._jac - self._jac2) / length, (b - a) / length - u, problem.direction_weight)
+
+    def _polygon(self, problem: PostureProblem) -> np.ndarray:
+        points = [
+            self.kin.bearing_points(g.surface, self.world.supports[g.support].normal)
+            for g in problem.goals
+            if g.hard and g.loaded
+        ]
+        if not points:
+            return np.zeros((0, 2))
+        return support_polygon(np.concatenate(points)[:, :2])
+
+    def _balance_rows(self, problem: PostureProblem) -> None:
+        polygon = self._polygon(problem)
+        if len(polygon) < 3:
+            return
+        com = self.kin.com[:2].copy()
+        J = self.kin.com_jacobian()[:2]
+        A, b = polygon_halfplanes(polygon)
+        k = self._ineq.take(len(b))
+        self._ineq.J[k] = A @ J
+        self._ineq.hi[k] = np.maximum(b - problem.balance_margin - A @ com, -CONTACT_STEP)
+        self._ineq.lo[k] = -1e30
+        if problem.com_weight > 0:
+            self._target(J, com - polygon.mean(axis=0), problem.com_weight)
+        if problem.ellipse_weight > 0:
+            excess, gradient = support_ellipse(polygon).excess(com)
+            if excess > 0:
+                self._target((gradient @ J)[None], np.array([excess]), problem.ellipse_weight)
+
+    def _lean_rows(self, surface: str, direction: np.ndarray, weight: float) -> None:
+        kin = self.kin
+        s = self.world.surfaces[surface]
+        a = kin.point(s.body, s.centre)
+        body, b = kin.landmark(self.world.robot.limb_of(surface).root)
+        length = float(np.linalg.norm(b - a))
+        kin.point_jacobian(body, b, self._jac)
+        kin.point_jacobian(s.body, a, self._jac2)
+        self._target((self._jac - self._jac2) / length, (b - a) / length - direction, weight)
+
+    def _distance_rows(self, clearance: np.ndarray) -> None:
+        kin = self.kin
+        near = kin.proximity(ACTIVE_RANGE, np.isfinite(clearance))
+        if len(near.pairs) == 0:
+            return
+        k = self._ineq.take(len(near.pairs))
+        pairs = self.world.pairs[near.pairs]
+        for row, (a, b), n, p1, p2 in zip(
+            range(k.start, k.stop), self._geom_body[pairs], near.normal, near.first, near.second, strict=True
+        ):
+            if a and b:
+                kin.point_jacobian(int(b), p2, self._jac)
+                kin.point_jacobian(int(a), p1, self._jac2)
+                self._ineq.J[row] = n @ (self._jac - self._jac2)
+            elif b:
+                self._ineq.J[row] = n @ kin.point_jacobian(int(b), p2)
+            else:
+                self._ineq.J[row] = -n @ kin.point_jacobian(int(a), p1)
+        self._ineq.lo[k] = np.minimum(clearance[near.pairs] - near.distance, DISTANCE_STEP)
+        self._ineq.hi[k] = 1e30
+
+
+def _clip(e: np.ndarray) -> np.ndarray:
+    """Shorten an error vector to what one iteration may ask for."""
+    n = float(np.linalg.norm(e))
+    return e if n <= CONTACT_STEP else e * (CONTACT_STEP / n)
+
+
+def support_rotation(support: Support, quaternion: np.ndarray) -> np.ndarray:
+    """R_WC of a contact whose z is the support's normal and whose x is the quaternion's."""
+    return frame_from_normal(support.normal, matrix_from_quat(quaternion)[:, 0])

@@ -1,0 +1,301 @@
+"""What the three optimisers share: the task, its cost and the verified result.
+
+The cost is the contact-stability cost of the new contacts, (4.19) with (4.25),
+
+    L_s = sum_i w || X_i - S_i ||^2        over the horizontal,
+
+X_i the contact and S_i the projection of the mass that its limb supports. Each method
+finds new contact positions on their supports, inside the supports' bounds (4.21), and a
+posture that closes every contact, balanced and free of collisions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from clamber.contact import Contact
+from clamber.errors import Status
+from clamber.model import Kinematics, World, bearing_frames
+from clamber.posture.ik import (
+    IK,
+    ContactGoal,
+    PostureProblem,
+    Residuals,
+    base_clearance,
+    contact_clearance,
+    support_rotation,
+)
+from clamber.se3 import quat_from_matrix
+from clamber.statics import (
+    Phase,
+    StaticEquilibrium,
+    TorqueLimits,
+    contact_angle,
+    contact_phase,
+    projected_distance,
+    static_equilibrium,
+    theta_max,
+)
+
+STABILITY_WEIGHT = 5.0  # w of (4.25)
+CLEARANCE = 0.010  # [m] p_safe: between links, and between links and the scene
+HOLD_WEIGHT = 40.0  # of a new contact at a position that an outer method prescribes
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class KeyframeTask:
+    """One stance to find a stable posture for.
+
+    Attributes:
+        held: Contacts that keep their place.
+        new: Contacts to optimise; their positions are the references.
+        directions: Demonstrated body segments, unit vectors in the world.
+        q_reference: (nq,) the posture to stay close to where nothing else decides.
+        base_rotation: (3, 3) preferred R_WB.
+    """
+
+    held: tuple[Contact, ...]
+    new: tuple[Contact, ...]
+    q_reference: np.ndarray
+    directions: Mapping[str, np.ndarray] = field(default_factory=lambda: MappingProxyType({}))
+    base_rotation: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class KeyframeOptions:
+    """How postures are optimised.
+
+    Attributes:
+        stability_weight: w of (4.25). Larger: contacts under the masses they support,
+            farther from the demonstration.
+        reference_weight: Of the distance to the demonstrated contact (`direct`).
+        direction_weight: Of the demonstrated directions. Larger: looks more like the
+            person; too large: contacts are missed.
+        balance_margin: [m] the centre of mass stays this far inside the polygon.
+        delta_stop: Stop when the cost changes by less (`lbfgs`, `gradient`).
+        gradient_stop: Stop when the gradient's norm is below (`lbfgs`, `gradient`).
+        max_iterations: Cap of the outer iterations.
+        learning_rate: alpha of (4.23) (`gradient`).
+    """
+
+    stability_weight: float = STABILITY_WEIGHT
+    reference_weight: float = 1.5
+    direction_weight: float = 0.2
+    balance_margin: float = 0.025
+    delta_stop: float = 1e-6
+    gradient_stop: float = 1e-3
+    max_iterations: int = 200
+    learning_rate: float = 0.1
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ContactState:
+    """A contact with its geometric stability (4.17).
+
+    Attributes:
+        contact: Where it is.
+        projected_distance: d, horizontal, to the mass it supports [m].
+        contact_angle: theta, from the vertical to the line to that mass [rad].
+        phase: supporting, reach-to-supportable or sliding.
+    """
+
+    contact: Contact
+    projected_distance: float
+    contact_angle: float
+    phase: Phase
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Keyframe:
+    """An optimised posture and the evidence that it is stable."""
+
+    q: np.ndarray
+    contacts: tuple[ContactState, ...]
+    com: np.ndarray
+    com_margin: float
+    equilibrium: StaticEquilibrium
+    residuals: Residuals
+    status: Status
+    method: str
+    iterations: int
+    cost_before: float
+    cost_after: float
+
+    @property
+    def stance(self) -> tuple[Contact, ...]:
+        """The contacts alone."""
+        return tuple(c.contact for c in self.contacts)
+
+
+def held_goal(world: World, c: Contact, *, loaded: bool = True) -> ContactGoal:
+    """A contact that keeps its place."""
+    return ContactGoal(
+        surface=c.surface,
+        support=c.support,
+        position=c.position,
+        rotation=support_rotation(world.supports[c.support], c.quaternion),
+        loaded=loaded,
+    )
+
+
+def keyframe_problem(
+    world: World,
+    task: KeyframeTask,
+    options: KeyframeOptions,
+    new: tuple[ContactGoal, ...],
+) -> PostureProblem:
+    """The posture problem of a stance, with `new` as goals of the new contacts."""
+    where = {c.surface: c.support for c in (*task.held, *task.new)}
+    return PostureProblem(
+        goals=(*(held_goal(world, c) for c in task.held), *new),
+        q_reference=task.q_reference,
+        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where),
+        directions=task.directions,
+        direction_weight=options.direction_weight,
+        base_rotation=task.base_rotation,
+        balance_margin=options.balance_margin,
+    )
+
+
+def prescribed_goals(world: World, task: KeyframeTask, positions: np.ndarray) -> tuple[ContactGoal, ...]:
+    """New contacts wanted at `positions` (n, 3), closed on their supports."""
+    return tuple(
+        ContactGoal(
+            surface=c.surface,
+            support=c.support,
+            position=p,
+            rotation=support_rotation(world.supports[c.support], c.quaternion),
+            free=True,
+            reference=HOLD_WEIGHT,
+        )
+        for c, p in zip(task.new, positions, strict=True)
+    )
+
+
+def stability_cost(
+    kin: Kinematics, task: KeyframeTask, positions: np.ndarray, weight: float
+) -> tuple[float, np.ndarray]:
+    """L_s and its gradient (n, 2) in the horizontal contact positions (4.24).
+
+    `kin` is at the posture that goes with the positions (n, 3); the gradient holds the
+    supported masses still, as the method does.
+    """
+    cost, grad = 0.0, np.zeros((len(task.new), 2))
+    for i, (c, x) in enumerate(zip(task.new, positions, strict=True)):
+        mass = kin.landmark(kin.world.robot.limb_of(c.surface).root)[1]
+        e = x[:2] - mass[:2]
+        cost += weight * float(e @ e)
+        grad[i] = 2.0 * weight * e
+    return cost, grad
+
+
+def new_positions(kin: Kinematics, task: KeyframeTask) -> np.ndarray:
+    """(n, 3) where the new contacts touch at the present posture."""
+    supports = kin.world.supports
+    return np.array([kin.contact_point(c.surface, supports[c.support].normal) for c in task.new]).reshape(-1, 3)
+
+
+def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> ContactState:
+    """Geometric stability of a contact at the present posture."""
+    mass = kin.landmark(kin.world.robot.limb_of(c.surface).root)[1]
+    d = projected_distance(c.position, mass)
+    theta = contact_angle(c.position, mass)
+    length = float(np.linalg.norm(mass - c.position))
+    limit = theta_max(kin.world.supports[c.support].friction)
+    return ContactState(
+        contact=c,
+        projected_distance=d,
+        contact_angle=theta,
+        phase=contact_phase(d, length, limit, loaded=loaded),
+    )
+
+
+def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEquilibrium:
+    """Static equilibrium with friction cones and torque limits at the present posture."""
+    w = kin.world
+    names, points, normals, mu = bearing_frames(kin, [(c.surface, c.support) for c in contacts])
+    J = np.concatenate(
+        [kin.point_jacobian(w.surfaces[n].body, p).copy() for n, p in zip(names, points, strict=True)]
+    )
+    return static_equilibrium(
+        points,
+        normals,
+        mu,
+        kin.com.copy(),
+        w.mass,
+        names=names,
+        torque=TorqueLimits(
+            jacobian=J, gravity=kin.gravity(), dofs=w.dadr, limits=w.tau_max, names=w.joints
+        ),
+    )
+
+
+def finish(
+    ik: IK,
+    task: KeyframeTask,
+    options: KeyframeOptions,
+    q: np.ndarray,
+    *,
+    method: str,
+    iterations: int,
+    cost_before: float,
+) -> Keyframe:
+    """Measure a posture: contacts where they are, margins, equilibrium, status.
+
+    A posture counts as stable when every constraint holds, its new contacts support
+    their masses and static equilibrium is feasible.
+    """
+    world = ik.world
+    kin = ik.kin
+    kin.update(q)
+    new = tuple(
+        Contact(
+            surface=c.surface,
+            support=c.support,
+            position=p,
+            quaternion=_orientation(kin, c),
+        )
+        for c, p in zip(task.new, new_positions(kin, task), strict=True)
+    )
+    measured = KeyframeTask(
+        held=(*task.held, *new), new=(), q_reference=q, directions=task.directions
+    )
+    residuals = ik.residuals(keyframe_problem(world, measured, options, ()), q)
+    states = tuple(contact_state(kin, c) for c in measured.held)
+    cost_after, _ = stability_cost(kin, task, new_positions(kin, task), options.stability_weight)
+    com = kin.com.copy()
+    equilibrium = equilibrium_at(kin, measured.held)
+    status = residuals.status
+    fresh = {c.surface for c in task.new}
+    if status is Status.SOLVED and any(
+        s.phase == "sliding" and s.contact.surface in fresh for s in states
+    ):
+        status = Status.SLIDING
+    if status is Status.SOLVED and not equilibrium.feasible:
+        status = Status.OVERLOADED
+    return Keyframe(
+        q=q,
+        contacts=states,
+        com=com,
+        com_margin=residuals.com_margin,
+        equilibrium=equilibrium,
+        residuals=residuals,
+        status=status,
+        method=method,
+        iterations=iterations,
+        cost_before=cost_before,
+        cost_after=cost_after,
+    )
+
+
+def _orientation(kin: Kinematics, c: Contact) -> np.ndarray:
+    """The contact's orientation: as reached by a flat surface, else as demonstrated."""
+    s = kin.world.surfaces[c.surface]
+    if s.rotation is None:
+        return quat_from_matrix(support_rotation(kin.world.supports[c.support], c.quaternion))
+    R = kin.rotation(s.body) @ s.rotation
+    return quat_from_matrix(support_rotation(kin.world.supports[c.support], quat_from_matrix(R)))

@@ -1,0 +1,90 @@
+"""Rotations and poses, batched: quaternions are wxyz, matrices are (..., 3, 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+def matrix_from_rpy(rpy: ArrayLike) -> np.ndarray:
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of fixed-axis angles [rad]."""
+    r, p, y = np.asarray(rpy, dtype=float)
+    cr, sr, cp, sp, cy, sy = np.cos(r), np.sin(r), np.cos(p), np.sin(p), np.cos(y), np.sin(y)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def matrix_from_quat(quat: ArrayLike) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(r, axis=-1) for r in rows], axis=-2)
+
+
+def quat_from_matrix(R: ArrayLike) -> np.ndarray:
+    """Unit quaternion (4,), w >= 0, of a rotation matrix (3, 3)."""
+    R = np.asarray(R, dtype=float)
+    K = np.array(
+        [
+            [np.trace(R), 0, 0, 0],
+            [R[2, 1] - R[1, 2], R[0, 0] - R[1, 1] - R[2, 2], 0, 0],
+            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], 0],
+            [R[1, 0] - R[0, 1], R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1]],
+        ]
+    )
+    q = np.linalg.eigh(K)[1][:, -1]  # reads the lower triangle [Bar-Itzhack00]
+    return q if q[0] >= 0 else -q
+
+
+def quat_multiply(a: ArrayLike, b: ArrayLike) -> np.ndarray:
+    """Hamilton product (..., 4)."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a, dtype=float), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b, dtype=float), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quat_conjugate(q: ArrayLike) -> np.ndarray:
+    """Inverse of unit quaternions (..., 4)."""
+    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def rotation_vector(R: np.ndarray) -> np.ndarray:
+    """Rotation vector (3,) of a rotation matrix (3, 3) [rad]."""
+    w, *v = quat_from_matrix(R)
+    v = np.array(v)
+    n = float(np.linalg.norm(v))
+    return 2.0 * v if n < 1e-12 else v * (2.0 * np.arctan2(n, w) / n)
+
+
+def frame_from_normal(normal: ArrayLike, heading: ArrayLike) -> np.ndarray:
+    """Rotation (3, 3) with z along `normal` and x along `heading` as far as it can.
+
+    Where the heading is parallel to the normal, x is any direction in the plane.
+    """
+    z = np.asarray(normal, dtype=float)
+    x = np.asarray(heading, dtype=float)
+    x = x - z * (x @ z)
+    n = np.linalg.norm(x)
+    if n < 1e-9:
+        x = np.eye(3)[np.argmin(np.abs(z))]
+        x = x - z * (x @ z)
+        n = np.linalg.norm(x)
+    x = x / n
+    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -1,0 +1,275 @@
+"""World, trajectory, controller -> rollout -> verdict: what physics makes of a plan.
+
+Nothing but `mj_step` touches the simulated state; the rollout holds the command of every
+step, so that plain MuJoCo arrives at the same states from the first one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from clamber.control import PID
+from clamber.model import PHYSICS_STEP, World
+from clamber.pipeline import Plan
+from clamber.scene import GROUND
+from clamber.trajectory import Trajectory
+
+STRIDE = 10  # physics steps between two recorded states
+SETTLE = 1.0  # [s] the end must hold this long
+END_SPEED = 0.05  # [m/s] of the pelvis at the end
+TILT_TOL = np.radians(20.0)  # pelvis against the plan at the end
+HEIGHT_TOL = 0.08  # [m] pelvis against the plan at the end
+UNINTENDED_TOL = 0.01  # share of all support on parts that are no surface
+SHARE_ON_PLAN = 0.97  # of the weight, at the end, on the surfaces planned
+OVERLAP_TOL = 0.010  # [m] of the robot with itself or with the scene
+GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
+YAW_TOL = np.radians(15.0)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Rollout:
+    """What physics did.
+
+    Attributes:
+        ctrl: (N, nu) commands, one for each step.
+        stride: Steps between two recorded states.
+        time: (M,) [s]; qpos (M, nq), qvel (M, nv): the state BEFORE steps 0, stride ...
+        actuator_force: (M, nu) [N m]; contact_force: (M, nS, 3) [N] on each surface, in
+            the world; unintended: (M,) normal force on other parts [N].
+        surfaces: Names of the nS surfaces.
+        overlap: Deepest overlap of the robot with itself and of anything else [m].
+        end_share: Vertical force, share of the weight, by `surface@support` over the last
+            second; other parts are called `other`.
+        unintended_share: Normal impulse on other parts over that on all.
+        contact_tracking: (M,) contacts planned closed that are.
+    """
+
+    ctrl: np.ndarray
+    stride: int
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    actuator_force: np.ndarray
+    contact_force: np.ndarray
+    unintended: np.ndarray
+    surfaces: tuple[str, ...]
+    overlap: float
+    self_overlap: float
+    self_pair: str
+    end_share: dict[str, float]
+    unintended_share: float
+    unintended_parts: dict[str, float]
+    end_speed: float
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Criterion:
+    """One figure with its limit."""
+
+    value: float
+    limit: float
+    ok: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Verdict:
+    """Whether physics got the robot there, and by which figures."""
+
+    reached: bool
+    criteria: dict[str, Criterion]
+
+
+def simulate(plan: Plan, *, progress: Callable[[str, float, str], None] | None = None) -> Rollout:
+    """Run the trajectory of a plan in MuJoCo under joint PID.
+
+    Raises:
+        ValueError: The plan has no trajectory.
+    """
+    if plan.trajectory is None:
+        raise ValueError("the plan has no trajectory")
+    return _run(plan.world, plan.trajectory, progress or (lambda stage, share, note: None))
+
+
+def _run(
+    world: World, trajectory: Trajectory, report: Callable[[str, float, str], None]
+) -> Rollout:
+    model = world.model
+    data = mujoco.MjData(model)
+    data.qpos[:] = trajectory.q[0]
+    controller = PID(world, trajectory)
+    n = len(trajectory.time)
+    m = -(-n // STRIDE)
+    surfaces = tuple(world.surfaces)
+    meter = _ContactMeter(world, surfaces)
+    ctrl = np.zeros((n, model.nu))
+    qpos, qvel = np.zeros((m, model.nq)), np.zeros((m, model.nv))
+    effort = np.zeros((m, model.nu))
+    force, unintended = np.zeros((m, len(surfaces), 3)), np.zeros(m)
+    overlap = speed = 0.0
+    tail = n - round(SETTLE / PHYSICS_STEP)
+    order = [model.actuator(j).id for j in world.joints]
+    for k in range(n):
+        row, first = divmod(k, STRIDE)
+        if first == 0:
+            qpos[row], qvel[row] = data.qpos, data.qvel
+        ctrl[k, order] = controller.command(k, data.qpos[world.qadr])
+        data.ctrl[:] = ctrl[k]
+        mujoco.mj_step(model, data)
+        if data.ncon:
+            overlap = max(overlap, -float(data.contact.dist.min()))
+        if k >= tail:
+            speed = max(speed, float(np.linalg.norm(data.qvel[:3])))
+        if first == 0 or k >= tail:
+            forces, other = meter.measure(data, end=k >= tail, total=first == 0)
+            if first == 0:
+                effort[row] = data.actuator_force
+                force[row], unintended[row] = forces, other
+        if k % 1000 == 0:
+            report("simulate", k / n, f"{k * PHYSICS_STEP:.0f} of {n * PHYSICS_STEP:.0f} s")
+    report("simulate", 1.0, "")
+    self_overlap, pair = deepest_self_overlap(world, qpos)
+    weight = world.mass * 9.81 * (n - tail)
+    return Rollout(
+        ctrl=ctrl,
+        stride=STRIDE,
+        time=np.arange(m) * STRIDE * PHYSICS_STEP,
+        qpos=qpos,
+        qvel=qvel,
+        actuator_force=effort,
+        contact_force=force,
+        unintended=unintended,
+        surfaces=surfaces,
+        overlap=overlap,
+        self_overlap=self_overlap,
+        self_pair=pair,
+        end_share={k: v / weight for k, v in sorted(meter.end.items())},
+        unintended_share=meter.other / max(meter.total, 1e-9),
+        unintended_parts={k: v / max(meter.total, 1e-9) for k, v in sorted(meter.parts.items())},
+        end_speed=speed,
+    )
+
+
+class _ContactMeter:
+    """Sums contact forces by surface, straight from the solver's contacts."""
+
+    def __init__(self, world: World, surfaces: tuple[str, ...]) -> None:
+        m = world.model
+        self.model = m
+        self.row = np.full(m.ngeom, -1)
+        for i, s in enumerate(surfaces):
+            self.row[list(world.surfaces[s].geoms)] = i
+        self.surfaces = surfaces
+        self.env = m.body_weldid[m.geom_bodyid] == 0
+        self.end: dict[str, float] = {}
+        self.parts: dict[str, float] = {}
+        self.total = self.other = 0.0
+        self._force = np.zeros(6)
+
+    def measure(
+        self, data: mujoco.MjData, *, end: bool, total: bool
+    ) -> tuple[np.ndarray, float]:
+        """(nS, 3) forces of the scene on the surfaces, and on other parts; adds to sums."""
+        forces, other = np.zeros((len(self.surfaces), 3)), 0.0
+        for i in range(data.ncon):
+            c = data.contact[i]
+            a, b = int(c.geom1), int(c.geom2)
+            if self.env[a] == self.env[b]:
+                continue
+            mujoco.mj_contactForce(self.model, data, i, self._force)
+            support, geom, sign = (a, b, 1.0) if self.env[a] else (b, a, -1.0)
+            world_force = sign * (self._force[:3] @ c.frame.reshape(3, 3))
+            row = self.row[geom]
+            if row >= 0:
+                forces[row] += world_force
+            else:
+                other += self._force[0]
+            if total:
+                self.total += self._force[0]
+                if row < 0:
+                    self.other += self._force[0]
+                    part = self.model.geom(geom).name
+                    self.parts[part] = self.parts.get(part, 0.0) + self._force[0]
+            if end:
+                name = self.surfaces[row] if row >= 0 else "other"
+                key = f"{name}@{self.model.geom(support).name}"
+                self.end[key] = self.end.get(key, 0.0) + float(world_force[2])
+        return forces, other
+
+
+def deepest_self_overlap(world: World, qpos: np.ndarray, every: int = 5) -> tuple[float, str]:
+    """Deepest overlap of the robot with itself over states (M, nq) [m], and the pair."""
+    from clamber.model import Kinematics
+
+    kin = Kinematics(world)
+    env = world.model.body_weldid[world.model.geom_bodyid] == 0
+    own = ~env[world.pairs].any(axis=1)
+    worst, pair = 0.0, ""
+    for q in qpos[::every]:
+        kin.update(q)
+        near = kin.proximity(0.0, own)
+        if len(near.distance) and -near.distance.min() > worst:
+            i = int(np.argmin(near.distance))
+            worst = -float(near.distance[i])
+            pair = " and ".join(world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]])
+    return worst, pair
+
+
+def judge(plan: Plan, rollout: Rollout) -> Verdict:
+    """Did the robot end where the plan says, on what it planned to rest on?"""
+    assert plan.trajectory is not None
+    world = plan.world
+    planned, last = plan.trajectory.q[-1], rollout.qpos[-1]
+    final = plan.keyframes[-1].stance
+    on_plan = sum(rollout.end_share.get(f"{c.surface}@{c.support}", 0.0) for c in final)
+    on_ground = sum(v for k, v in rollout.end_share.items() if k.endswith("@" + GROUND))
+    on_boxes = sum(rollout.end_share.values()) - on_ground
+    up, up_planned = (_up(q[3:7]) for q in (last, planned))
+    tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
+    tops = [world.supports[c.support].position[2] for c in final]
+    effort = float(np.abs(rollout.actuator_force).max() / world.tau_max.max())
+    goal = {
+        "planned to the last stance": _at_least(float(plan.complete), 1.0),
+        "share of the weight at the end on planned contacts": _at_least(on_plan, SHARE_ON_PLAN),
+        "pelvis speed at the end [m/s]": _at_most(rollout.end_speed, END_SPEED),
+        "pelvis tilt at the end against the plan [rad]": _at_most(tilt, float(TILT_TOL)),
+        "pelvis height at the end against the plan [m]": _at_most(
+            float(abs(last[2] - planned[2])), HEIGHT_TOL
+        ),
+        "share of support on parts that are no surface": _at_most(
+            rollout.unintended_share, UNINTENDED_TOL
+        ),
+        "deepest overlap with the scene [m]": _at_most(rollout.overlap, OVERLAP_TOL),
+        "deepest overlap with itself [m]": _at_most(rollout.self_overlap, OVERLAP_TOL),
+        "largest effort, share of the limit": _at_most(effort, 1.0 + 1e-6),
+    }
+    if world.scene.goal is None:
+        goal["share of the weight at the end on obstacles"] = _at_least(on_boxes, 0.98)
+        goal["pelvis above its support at the end [m]"] = _at_least(
+            float(last[2] - max(tops, default=0.0)), 0.05
+        )
+    else:
+        xy = world.scene.goal[:2]
+        goal["pelvis to the goal [m]"] = _at_most(float(np.linalg.norm(last[:2] - xy)), GOAL_TOL)
+        if len(world.scene.goal) == 3:
+            w, x, y, z = last[3:7]
+            yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+            off = float(abs((yaw - world.scene.goal[2] + np.pi) % (2 * np.pi) - np.pi))
+            goal["yaw to the goal [rad]"] = _at_most(off, float(YAW_TOL))
+    return Verdict(reached=all(c.ok for c in goal.values()), criteria=goal)
+
+
+def _up(quat: np.ndarray) -> np.ndarray:
+    w, x, y, z = quat
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _at_most(value: float, limit: float) -> Criterion:
+    return Criterion(value=value, limit=limit, ok=bool(value <= limit))
+
+
+def _at_least(value: float, limit: float) -> Criterion:
+    return Criterion(value=value, limit=limit, ok=bool(value >= limit))

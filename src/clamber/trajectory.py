@@ -1,0 +1,246 @@
+"""Paths -> one timed trajectory, 1 kHz, velocity the exact derivative.
+
+Each phase is a cubic spline through its postures, at rest at both ends, parametrised by
+the largest joint angle travelled; time runs along it under a velocity profile that
+accelerates, cruises at the speed limit and brakes. The base's rotation is the normalised
+spline of its quaternion, so that the angular velocity is its derivative on the manifold.
+
+Feed-forward torques balance gravity with the contact forces of least norm at every
+posture, and are interpolated along the spline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
+
+from clamber.contact import Contact
+from clamber.model import Kinematics, World, bearing_frames
+from clamber.path import Phase
+from clamber.se3 import quat_conjugate, quat_multiply
+from clamber.statics import contact_forces
+
+RATE = 1000.0  # [Hz]
+REST = 0.10  # [s] at rest between two phases
+HOLD_START = 0.3  # [s]
+HOLD_END = 2.0  # [s] the last posture is held
+ACCELERATION = 4.0  # [1/s] the cruise speed is reached after a quarter of a second
+MIN_PHASE = 0.2  # [s]
+BASE_LENGTH = 0.3  # [m] of base translation count as one radian
+SAMPLES = 24  # per gap between two postures, to find the largest speed
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Trajectory:
+    """A timed reference.
+
+    Attributes:
+        time: (T,) [s]; q: (T, nq); v: (T, nv) the derivative of q on the manifold.
+        tau: (T, na) feed-forward joint torques [N m].
+        contact: (T, nS) bool, closed contacts by `surfaces`.
+        joints: (na,) names.
+        keyframes: (K,) time at which each keyframe is reached [s].
+    """
+
+    time: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    tau: np.ndarray
+    contact: np.ndarray
+    surfaces: tuple[str, ...]
+    joints: tuple[str, ...]
+    keyframes: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check shapes, make arrays read-only."""
+        n = len(self.time)
+        for name in ("q", "v", "tau", "contact"):
+            x = getattr(self, name)
+            if len(x) != n:
+                raise ValueError(f"{name} has {len(x)} rows, expected {n}")
+            x.setflags(write=False)
+
+    def at(self, t: float) -> int:
+        """Index of the sample at time `t` [s], clipped to the ends."""
+        return int(np.clip(round(t * RATE), 0, len(self.time) - 1))
+
+    def velocity_error(self, world: World) -> float:
+        """Largest difference of v and the central difference of q [rad/s, m/s]."""
+        kin = Kinematics(world)
+        worst = 0.0
+        for k in range(1, len(self.time) - 1, 7):
+            v = kin.difference(self.q[k - 1], self.q[k + 1]) * (RATE / 2)
+            worst = max(worst, float(np.abs(v - self.v[k]).max()))
+        return worst
+
+
+def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
+    """(n, na) torques that hold each posture of a phase, load handed over along it."""
+    by_name = {c.surface: c for c in phase.contacts}
+    ends = []
+    for load in (phase.load_before, phase.load_after):
+        contacts = tuple(by_name[s] for s in load)
+        ends.append([holding_torque(kin, q, contacts) for q in phase.q])
+        if phase.load_after == phase.load_before:
+            ends.append(ends[0])
+            break
+    share = _arclength(kin, phase.q)
+    share = (share / share[-1])[:, None] if share[-1] > 0 else np.zeros((len(share), 1))
+    return (1 - share) * np.array(ends[0]) + share * np.array(ends[1])
+
+
+def holding_torque(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> np.ndarray:
+    """(na,) joint torques that balance gravity with the least contact forces."""
+    w = kin.world
+    kin.update(q)
+    tau = kin.gravity()
+    names, points, normals, mu = bearing_frames(kin, [(c.surface, c.support) for c in contacts])
+    forces = contact_forces(points, normals, mu, kin.com.copy(), w.mass).forces
+    for name, p, f in zip(names, points, forces, strict=True):
+        tau = tau - kin.point_jacobian(w.surfaces[name].body, p).T @ f
+    return np.clip(tau[w.dadr], -w.tau_max, w.tau_max)
+
+
+def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
+    """(n,) path parameter: the largest joint angle travelled, base included, scaled."""
+    steps = [0.0]
+    for a, b in zip(nodes, nodes[1:], strict=False):
+        d = kin.difference(a, b)
+        d[:3] /= BASE_LENGTH
+        steps.append(max(float(np.abs(d).max()), 1e-6))
+    return np.cumsum(steps)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Spline:
+    """One phase as a function of its path parameter."""
+
+    curve: CubicSpline
+    tau: BSpline
+    length: float
+    cruise: float  # ds/dt at which the fastest joint has the speed limit
+
+    def sample(self, s: np.ndarray, sdot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        raw, slope = self.curve(s), self.curve(s, 1)
+        q, v = _on_manifold(raw, slope)
+        return q, v * sdot[:, None]
+
+
+def _on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Configurations (n, nq) and tangent vectors (n, nv) of raw coordinates."""
+    q = raw.copy()
+    norm = np.linalg.norm(raw[:, 3:7], axis=1, keepdims=True)
+    unit = raw[:, 3:7] / norm
+    q[:, 3:7] = unit
+    rate = (slope[:, 3:7] - unit * np.sum(unit * slope[:, 3:7], axis=1, keepdims=True)) / norm
+    omega = 2.0 * quat_multiply(quat_conjugate(unit), rate)[:, 1:]
+    return q, np.concatenate([slope[:, :3], omega, slope[:, 7:]], axis=1)
+
+
+def _spline(kin: Kinematics, phase: Phase, speed: float, v_max: np.ndarray) -> _Spline:
+    nodes = phase.q.copy()
+    for k in range(1, len(nodes)):
+        if nodes[k, 3:7] @ nodes[k - 1, 3:7] < 0:
+            nodes[k, 3:7] *= -1
+    s = _arclength(kin, nodes)
+    curve = CubicSpline(s, nodes, bc_type="natural" if len(nodes) > 2 else "not-a-knot")
+    tau = make_interp_spline(s, phase_torques(kin, phase), k=1)
+    fine = np.linspace(0.0, s[-1], SAMPLES * len(nodes))
+    _, slope = _on_manifold(curve(fine), curve(fine, 1))
+    slope = np.abs(slope)
+    slope[:, :3] /= BASE_LENGTH
+    limit = np.minimum(speed, v_max)
+    cruise = float((limit / np.maximum(slope.max(axis=0), 1e-9)).min())
+    return _Spline(curve, tau, float(s[-1]), cruise)
+
+
+def _profile(length: float, cruise: float) -> np.ndarray:
+    """(n, 2) s and ds/dt at 1 kHz: smooth rise to the cruise speed, smooth fall.
+
+    The rise is a raised cosine, so that acceleration has no jumps.
+    """
+    ramp = 1.5 / ACCELERATION
+    if length < cruise * ramp:
+        cruise = length / ramp
+    total = max(length / cruise + ramp, MIN_PHASE, 2 * ramp)
+    n = int(np.ceil(total * RATE))
+    t = np.arange(1, n + 1) / n * total
+
+    def rise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = np.clip(x, 0.0, ramp)
+        return (
+            0.5 * (x - ramp / np.pi * np.sin(np.pi * x / ramp)),
+            0.5 * (1 - np.cos(np.pi * x / ramp)),
+        )
+
+    up, up_rate = rise(t)
+    down, down_rate = rise(total - t)
+    plateau = max(total - 2 * ramp, 0.0)
+    s = np.where(
+        t <= ramp,
+        up,
+        np.where(t <= ramp + plateau, 0.5 * ramp + (t - ramp), ramp + plateau - down),
+    )
+    rate = np.where(t <= ramp, up_rate, np.where(t <= ramp + plateau, 1.0, down_rate))
+    scale = length / (ramp + plateau)
+    return np.stack([s * scale, rate * scale], axis=1)
+
+
+def build_trajectory(
+    world: World, phases: Sequence[Phase], *, speed: float, keyframe_after: Sequence[int] = ()
+) -> Trajectory:
+    """Time the phases one after the other.
+
+    Args:
+        world: Robot and scene.
+        phases: In order; each begins with the last posture of the one before.
+        speed: Largest joint speed [rad/s].
+        keyframe_after: Index of the phase at whose end each keyframe is reached.
+
+    Raises:
+        ValueError: Two phases do not join.
+    """
+    kin = Kinematics(world)
+    surfaces = tuple(world.surfaces)
+    q, v, tau, contact, ends = [], [], [], [], []
+
+    def hold(seconds: float, phase: Phase, posture: np.ndarray, torque: np.ndarray) -> None:
+        n = round(seconds * RATE)
+        q.append(np.tile(posture, (n, 1)))
+        v.append(np.zeros((n, world.model.nv)))
+        tau.append(np.tile(torque, (n, 1)))
+        closed = {c.surface for c in phase.contacts}
+        contact.append(np.tile([s in closed for s in surfaces], (n, 1)))
+
+    samples = 0
+    for i, phase in enumerate(phases):
+        if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
+            raise ValueError(f"phase {i} ({phase.kind}) does not begin where the last one ended")
+        spline = _spline(kin, phase, speed, world.v_max)
+        if i == 0:
+            first, _ = spline.sample(np.zeros(1), np.zeros(1))
+            hold(HOLD_START, phase, first[0], spline.tau(0.0))
+        s, rate = _profile(spline.length, spline.cruise).T
+        qs, vs = spline.sample(s, rate)
+        q.append(qs)
+        v.append(vs)
+        tau.append(spline.tau(s))
+        closed = {c.surface for c in phase.contacts}
+        contact.append(np.tile([x in closed for x in surfaces], (len(s), 1)))
+        hold(HOLD_END if i == len(phases) - 1 else REST, phase, qs[-1], tau[-1][-1])
+        samples = sum(map(len, q))
+        ends.append(samples - 1)
+    n = samples
+    return Trajectory(
+        time=np.arange(n) / RATE,
+        q=np.concatenate(q),
+        v=np.concatenate(v),
+        tau=np.concatenate(tau),
+        contact=np.concatenate(contact),
+        surfaces=surfaces,
+        joints=world.joints,
+        keyframes=np.array([0, *(ends[i] for i in keyframe_after)]) / RATE,
+    )

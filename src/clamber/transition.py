@@ -1,0 +1,232 @@
+"""Neighbouring keyframes -> the postures that move one contact.
+
+A move makes, breaks or replaces the contact of one limb. Its transition first shifts the
+weight onto the contacts that stay, then closes the new contact, unloaded, in
+reach-to-support mode (4.26, 4.27), and ends in the next keyframe, loaded. The shift
+holds the centre of mass inside the ellipse of the remaining contacts (4.28).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clamber.contact import Contact
+from clamber.errors import Status
+from clamber.model import World
+from clamber.posture.ik import (
+    IK,
+    ContactGoal,
+    PostureProblem,
+    Residuals,
+    Solution,
+    base_clearance,
+    contact_clearance,
+    support_rotation,
+)
+from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
+
+REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
+BALANCE_MARGIN = 0.025  # [m] of the centre of mass while a contact moves
+ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
+LEAN_WEIGHT = 0.5  # soft task (4.27)
+APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
+REACH_TOL = 0.02  # [m] a contact farther off than this is somewhere else
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Move:
+    """One limb's change of contact.
+
+    Attributes:
+        limb: Its name.
+        breaks: Surfaces that leave their contacts.
+        makes: The contact that is made, its position a reference until optimised.
+    """
+
+    limb: str
+    breaks: tuple[str, ...]
+    makes: Contact | None
+
+    def __str__(self) -> str:
+        """Such as `LHand -> LElbow on box`."""
+        made = f"{self.makes.surface} on {self.makes.support}" if self.makes else "air"
+        return f"{', '.join(self.breaks) or 'air'} -> {made}"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Transition:
+    """The postures that move one contact.
+
+    Attributes:
+        move: With the contact where it is made.
+        before, after: Configurations (nq,) of the keyframes.
+        shifted: (nq,) all old contacts closed, weight on those that stay.
+        touching: (nq,) the new contact closed, not loaded.
+        held: Contacts that stay.
+        leaving: Contacts that are broken.
+        status: Of the worst of its postures, with its residuals.
+    """
+
+    move: Move
+    before: np.ndarray
+    shifted: np.ndarray
+    touching: np.ndarray
+    after: np.ndarray
+    held: tuple[Contact, ...]
+    leaving: tuple[Contact, ...]
+    iterations: int
+    status: Status
+    residuals: Residuals
+
+
+def reach_to_support(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+    """(pitch, roll, yaw) of the moving link at its contact (4.26, 4.27) [rad].
+
+    Args:
+        p1: (3,) present contact point in the world.
+        p2: (3,) goal contact point in the world.
+        R_WB: (3, 3) the pelvis in the world.
+    """
+    p = p1 - p2
+    n = np.linalg.norm(p)
+    return REACH_ANGLE * (R_WB.T @ (p / n)) if n > 1e-9 else np.zeros(3)
+
+
+def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+    """(3,) unit vector from the new contact to the mass it will support.
+
+    The first two angles of (4.27) lean it from the vertical towards where the contact
+    comes from, so that the mass arrives behind its contact and moves over it as load
+    comes on.
+    """
+    pitch, roll, _ = reach_to_support(p1, p2, R_WB)
+    horizontal = R_WB @ np.array([np.sin(pitch), np.sin(roll), 0.0])
+    horizontal[2] = 0.0
+    return horizontal + np.array([0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))])
+
+
+def clearance_for(world: World, contacts: Mapping[str, str]) -> np.ndarray:
+    """(P,) p_safe everywhere, contacts excepted."""
+    return contact_clearance(world, base_clearance(world, CLEARANCE), contacts)
+
+
+def balance_problem(
+    world: World,
+    *,
+    held: tuple[Contact, ...],
+    closed: tuple[Contact, ...] = (),
+    q_reference: np.ndarray,
+    extra: tuple[ContactGoal, ...] = (),
+    posture_weight: float = 0.08,
+    touching: Mapping[str, str] | None = None,
+) -> PostureProblem:
+    """Balance on `held`, with `closed` in contact but not loaded."""
+    where = {c.surface: c.support for c in (*held, *closed)} | dict(touching or {})
+    return PostureProblem(
+        goals=(
+            *(held_goal(world, c) for c in held),
+            *(held_goal(world, c, loaded=False) for c in closed),
+            *extra,
+        ),
+        q_reference=q_reference,
+        clearance=clearance_for(world, where),
+        balance_margin=BALANCE_MARGIN,
+        posture_weight=posture_weight,
+        ellipse_weight=ELLIPSE_WEIGHT,
+        com_weight=0.3,
+        base_weight=0.0,
+    )
+
+
+def plan_transition(ik: IK, before: Keyframe, after: Keyframe, move: Move) -> Transition:
+    """Shift, touch and settle between two keyframes.
+
+    The new contact may still give way by `REACH_TOL` where the unloaded robot cannot
+    reach the loaded one's position; the caller then optimises the keyframe again.
+    """
+    world = ik.world
+    held = tuple(c for c in before.stance if c.surface not in move.breaks)
+    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    shift = ik.solve(
+        balance_problem(world, held=held, closed=leaving, q_reference=before.q), before.q
+    )
+    solutions = [shift]
+    if move.makes is None:
+        touching = after.q
+    else:
+        made = next(c for c in after.stance if c.surface == move.makes.surface)
+        touch = _touch(ik, held, made, shift.q, after.q)
+        solutions.append(touch)
+        touching = touch.q
+        move = replace(move, makes=made)
+    worst = max(solutions, key=lambda s: list(Status).index(s.status))
+    return Transition(
+        move=move,
+        before=before.q,
+        shifted=shift.q,
+        touching=touching,
+        after=after.q,
+        held=held,
+        leaving=leaving,
+        iterations=sum(s.iterations for s in solutions),
+        status=worst.status,
+        residuals=worst.residuals,
+    )
+
+
+def _touch(
+    ik: IK, held: tuple[Contact, ...], made: Contact, shifted: np.ndarray, after: np.ndarray
+) -> Solution:
+    """Close the new contact, starting from the loaded posture, the weight still held."""
+    world, kin = ik.world, ik.kin
+    kin.update(shifted)
+    support = world.supports[made.support]
+    p1 = kin.contact_point(made.surface, support.normal)
+    lean = lean_direction(p1, made.position, kin.rotation(world.base))
+    problem = balance_problem(
+        world,
+        held=held,
+        closed=(made,),
+        q_reference=0.5 * (shifted + after),
+    )
+    problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
+    return ik.solve(problem, after)
+
+
+def approach_contact(
+    ik: IK, held: tuple[Contact, ...], wanted: Contact, q: np.ndarray
+) -> tuple[Contact, Solution]:
+    """The nearest contact to `wanted` that closes while the others bear the weight.
+
+    Args:
+        ik: Workspace.
+        held: Contacts that stay.
+        wanted: Where the contact would be liked.
+        q: (nq,) to start from.
+    """
+    world = ik.world
+    goal = ContactGoal(
+        surface=wanted.surface,
+        support=wanted.support,
+        position=wanted.position,
+        rotation=support_rotation(world.supports[wanted.support], wanted.quaternion),
+        free=True,
+        loaded=False,
+        reference=APPROACH_WEIGHT,
+    )
+    problem = balance_problem(
+        world,
+        held=held,
+        q_reference=q,
+        extra=(goal,),
+        touching={wanted.surface: wanted.support},
+    )
+    solution = ik.solve(problem, q)
+    ik.kin.update(solution.q)
+    support = world.supports[wanted.support]
+    p = ik.kin.contact_point(wanted.surface, support.normal)
+    p = p - support.normal * support.height(p)
+    return replace(wanted, position=p), solution
