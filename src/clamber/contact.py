@@ -38,12 +38,15 @@ class Contact:
         support: Name of the support, such as `ground`.
         position: (3,) the point on the support, in the world [m].
         quaternion: (4,) orientation of C in the world, wxyz.
+        edge: A flat surface rolled onto one of its four edges: the edge's index, and
+            `position` is the middle of that edge. None while it lies flat.
     """
 
     surface: str
     support: str
     position: np.ndarray
     quaternion: np.ndarray
+    edge: int | None = None
 
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""

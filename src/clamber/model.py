@@ -12,7 +12,7 @@ are the floating base.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -232,6 +232,11 @@ class Surface:
         """A flat surface fixes orientation, a point surface does not."""
         return self.rotation is not None
 
+    def edge(self, i: int) -> Surface:
+        """Edge `i` of a flat surface, from corner i to the next, as a surface."""
+        ends = self.corners[[i, (i + 1) % len(self.corners)]]
+        return replace(self, centre=ends.mean(axis=0), corners=ends)
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class World:
@@ -254,6 +259,7 @@ class World:
     scene: Scene
     home: np.ndarray
     surfaces: Mapping[str, Surface]
+    edges: Mapping[str, tuple[Surface, ...]]
     joints: tuple[str, ...]
     qadr: np.ndarray
     dadr: np.ndarray
@@ -269,6 +275,10 @@ class World:
     supports: Mapping[str, Support]
     base: int
     mass: float
+
+    def surface(self, name: str, edge: int | None = None) -> Surface:
+        """A surface, or one edge of it where it has rolled onto that."""
+        return self.surfaces[name] if edge is None else self.edges[name][edge]
 
     def landmark(self, name: str) -> tuple[int, np.ndarray]:
         """Body id and point (3,) in its frame of a body or, failing that, a geom."""
@@ -411,6 +421,10 @@ def _index(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World
         scene=scene,
         home=home,
         surfaces=surfaces,
+        edges={
+            n: tuple(s.edge(i) for i in range(len(s.corners))) if s.is_flat else ()
+            for n, s in surfaces.items()
+        },
         joints=joints,
         qadr=qadr,
         dadr=dadr,
@@ -644,14 +658,18 @@ class Kinematics:
         body, p = self._landmarks[name]
         return body, self.point(body, p)
 
-    def contact_point(self, surface: str, normal: np.ndarray) -> np.ndarray:
+    def contact_point(
+        self, surface: str, normal: np.ndarray, edge: int | None = None
+    ) -> np.ndarray:
         """(3,) the surface's point that touches a support with that normal."""
-        s = self.world.surfaces[surface]
+        s = self.world.surface(surface, edge)
         return self.point(s.body, s.centre) - s.radius * normal
 
-    def bearing_points(self, surface: str, normal: np.ndarray) -> np.ndarray:
+    def bearing_points(
+        self, surface: str, normal: np.ndarray, edge: int | None = None
+    ) -> np.ndarray:
         """(K, 3) the points that bear force on a support with that normal."""
-        s = self.world.surfaces[surface]
+        s = self.world.surface(surface, edge)
         return self.point(s.body, s.corners) - s.radius * normal
 
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
@@ -745,21 +763,3 @@ def limb_lengths(kin: Kinematics) -> dict[str, float]:
         ends = [[kin.landmark(getattr(x, n))[1] for n in names] for x in limbs]
         out[part] = float(np.mean([np.linalg.norm(b - a) for a, b in ends]))
     return out
-
-
-def bearing_frames(kin: Kinematics, contacts: Sequence[tuple[str, str]]) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Names, points (n, 3), normals (n, 3), friction (n,) of all bearing points.
-
-    Args:
-        kin: The configuration.
-        contacts: (surface, support) names.
-    """
-    names, points, normals, mu = [], [], [], []
-    for surface, support in contacts:
-        s = kin.world.supports[support]
-        p = kin.bearing_points(surface, s.normal)
-        names += [surface] * len(p)
-        points.append(p)
-        normals.append(np.tile(s.normal, (len(p), 1)))
-        mu += [s.friction] * len(p)
-    return names, np.concatenate(points), np.concatenate(normals), np.array(mu)

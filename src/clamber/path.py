@@ -37,7 +37,7 @@ class Phase:
         kind: shift (the weight), swing (the limb) or settle (load on the new contact).
         q: (n, nq) postures; the first is the last of the phase before.
         contacts: Contacts closed.
-        load_before, load_after: Surfaces that bear load at its start and end.
+        load_before, load_after: Contacts that bear load at its start and end.
         arc: (m, 3) control points of the moving surface before adaptation; empty where
             nothing moves.
     """
@@ -45,8 +45,8 @@ class Phase:
     kind: str
     q: np.ndarray
     contacts: tuple[Contact, ...]
-    load_before: tuple[str, ...]
-    load_after: tuple[str, ...]
+    load_before: tuple[Contact, ...]
+    load_after: tuple[Contact, ...]
     arc: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
@@ -104,19 +104,19 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     """
     t = transition
     names = tuple(c.surface for c in t.held)
-    all_before = names + tuple(c.surface for c in t.leaving)
+    before = (*t.held, *t.leaving)
     after = names + ((t.move.makes.surface,) if t.move.makes else ())
-    closed = (*t.held, *t.leaving)
-    shift = _bridge(ik, t.before, t.shifted, closed, all_before)
+    closed = (*t.held, *t.rolling)
+    shift = _bridge(ik, t.before, t.shifted, closed, tuple(c.surface for c in before))
     swing, control = _swing(ik, t, adapt)
     made = (*t.held, t.move.makes) if t.move.makes else t.held
     settle = _bridge(ik, t.touching, t.after, made, after)
     phases = (
-        Phase(kind="shift", q=shift, contacts=closed, load_before=all_before, load_after=names),
+        Phase(kind="shift", q=shift, contacts=closed, load_before=before, load_after=t.held),
         Phase(
-            kind="swing", q=swing, contacts=t.held, load_before=names, load_after=names, arc=control
+            kind="swing", q=swing, contacts=t.held, load_before=t.held, load_after=t.held, arc=control
         ),
-        Phase(kind="settle", q=settle, contacts=made, load_before=names, load_after=after),
+        Phase(kind="settle", q=settle, contacts=made, load_before=t.held, load_after=made),
     )
     status, note = check_phases(ik, phases, t)
     return Path(transition=t, phases=phases, status=status, note=note)
@@ -238,7 +238,7 @@ def _drift(ik: IK, q: np.ndarray, contacts: tuple[Contact, ...]) -> float:
     out = 0.0
     for c in contacts:
         n = ik.world.supports[c.support].normal
-        p = ik.kin.contact_point(c.surface, n)
+        p = ik.kin.contact_point(c.surface, n, c.edge)
         out = max(out, float(np.linalg.norm(p - c.position)))
     return out
 

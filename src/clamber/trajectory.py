@@ -18,8 +18,9 @@ import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 
 from clamber.contact import Contact
-from clamber.model import Kinematics, World, bearing_frames
+from clamber.model import Kinematics, World
 from clamber.path import Phase
+from clamber.posture.keyframe import bearing_frames
 from clamber.se3 import quat_conjugate, quat_multiply
 from clamber.statics import contact_forces
 
@@ -79,12 +80,10 @@ class Trajectory:
 
 def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
     """(n, na) torques that hold each posture of a phase, load handed over along it."""
-    by_name = {c.surface: c for c in phase.contacts}
     ends = []
     for load in (phase.load_before, phase.load_after):
-        contacts = tuple(by_name[s] for s in load)
-        ends.append([holding_torque(kin, q, contacts) for q in phase.q])
-        if phase.load_after == phase.load_before:
+        ends.append([holding_torque(kin, q, load) for q in phase.q])
+        if phase.load_after is phase.load_before:
             ends.append(ends[0])
             break
     share = _arclength(kin, phase.q)
@@ -97,7 +96,7 @@ def holding_torque(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
     w = kin.world
     kin.update(q)
     tau = kin.gravity()
-    names, points, normals, mu = bearing_frames(kin, [(c.surface, c.support) for c in contacts])
+    names, points, normals, mu = bearing_frames(kin, contacts)
     forces = contact_forces(points, normals, mu, kin.com.copy(), w.mass).forces
     for name, p, f in zip(names, points, forces, strict=True):
         tau = tau - kin.point_jacobian(w.surfaces[name].body, p).T @ f

@@ -66,7 +66,7 @@ class Transition:
         shifted: (nq,) all old contacts closed, weight on those that stay.
         touching: (nq,) the new contact closed, not loaded.
         held: Contacts that stay.
-        leaving: Contacts that are broken.
+        leaving: Contacts that are broken, as they were; `rolling` as they are let go.
         status: Of the worst of its postures, with its residuals.
     """
 
@@ -77,6 +77,7 @@ class Transition:
     after: np.ndarray
     held: tuple[Contact, ...]
     leaving: tuple[Contact, ...]
+    rolling: tuple[Contact, ...]
     iterations: int
     status: Status
     residuals: Residuals
@@ -108,9 +109,20 @@ def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarr
     return horizontal + np.array([0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))])
 
 
-def clearance_for(world: World, contacts: Mapping[str, str]) -> np.ndarray:
-    """(P,) p_safe everywhere, contacts excepted."""
-    return contact_clearance(world, base_clearance(world, CLEARANCE), contacts)
+def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
+    """A flat contact on the edge that lies farthest `towards` (3,); others as they are.
+
+    A foot that is about to leave may lift its heel: what it gains in reach is what a
+    person gains on tiptoe.
+    """
+    edges = ik.world.edges[c.surface]
+    if not edges:
+        return c
+    ik.kin.update(q)
+    normal = ik.world.supports[c.support].normal
+    points = np.array([ik.kin.contact_point(c.surface, normal, i) for i in range(len(edges))])
+    i = int(np.argmax(points @ (towards - c.position)))
+    return replace(c, edge=i, position=points[i])
 
 
 def balance_problem(
@@ -125,6 +137,7 @@ def balance_problem(
 ) -> PostureProblem:
     """Balance on `held`, with `closed` in contact but not loaded."""
     where = {c.surface: c.support for c in (*held, *closed)} | dict(touching or {})
+    rolling = [c.surface for c in (*held, *closed) if c.edge is not None]
     return PostureProblem(
         goals=(
             *(held_goal(world, c) for c in held),
@@ -132,7 +145,7 @@ def balance_problem(
             *extra,
         ),
         q_reference=q_reference,
-        clearance=clearance_for(world, where),
+        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where, rolling),
         balance_margin=BALANCE_MARGIN,
         posture_weight=posture_weight,
         ellipse_weight=ELLIPSE_WEIGHT,
@@ -150,8 +163,10 @@ def plan_transition(ik: IK, before: Keyframe, after: Keyframe, move: Move) -> Tr
     world = ik.world
     held = tuple(c for c in before.stance if c.surface not in move.breaks)
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    middle = np.mean([c.position for c in held], axis=0)
+    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
     shift = ik.solve(
-        balance_problem(world, held=held, closed=leaving, q_reference=before.q), before.q
+        balance_problem(world, held=held, closed=rolling, q_reference=before.q), before.q
     )
     solutions = [shift]
     if move.makes is None:
@@ -171,6 +186,7 @@ def plan_transition(ik: IK, before: Keyframe, after: Keyframe, move: Move) -> Tr
         after=after.q,
         held=held,
         leaving=leaving,
+        rolling=rolling,
         iterations=sum(s.iterations for s in solutions),
         status=worst.status,
         residuals=worst.residuals,

@@ -17,7 +17,7 @@ Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -39,6 +39,7 @@ DAMPING = 2e-4  # mu
 CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
+FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 EDGE_INSET = 0.005  # [m] contacts stay this far inside the support's border
 SOFT, EQUALITY = 8, 5  # daqp's constraint types
 
@@ -57,6 +58,7 @@ class ContactGoal:
         stability: Weight of (4.25), the horizontal distance from the contact to the mass
             it supports; only for free contacts.
         reference: Weight of the distance to `position`; free contacts and moving ones.
+        edge: The edge that a held flat surface may roll on; None keeps it flat.
     """
 
     surface: str
@@ -68,6 +70,7 @@ class ContactGoal:
     loaded: bool = True
     stability: float = 0.0
     reference: float = 0.0
+    edge: int | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -176,7 +179,10 @@ def base_clearance(world: World, margin: float) -> np.ndarray:
 
 
 def contact_clearance(
-    world: World, clearance: np.ndarray, contacts: Mapping[str, str]
+    world: World,
+    clearance: np.ndarray,
+    contacts: Mapping[str, str],
+    rolling: Collection[str] = (),
 ) -> np.ndarray:
     """Let surfaces touch the supports they stand on.
 
@@ -184,6 +190,7 @@ def contact_clearance(
         world: Robot and scene.
         clearance: (P,) to start from.
         contacts: Support by surface.
+        rolling: Flat surfaces on an edge, whose other edges may touch but not enter.
 
     Returns:
         (P,): the planning geom of a contact pair is left to the contact task; further
@@ -198,7 +205,8 @@ def contact_clearance(
         for i in np.flatnonzero(here):
             a, b = world.pairs[i]
             geom = int(a if b == g else b)
-            out[i] = -np.inf if name(geom).name == surface or s.is_flat else 0.0
+            planned = name(geom).name == surface or s.is_flat
+            out[i] = -np.inf if planned and surface not in rolling else 0.0
     return out
 
 
@@ -256,8 +264,14 @@ class IK:
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._geom_body = world.model.geom_bodyid
 
-    def build(self, problem: PostureProblem, q: np.ndarray) -> QP:
-        """The QP at `q`; `Kinematics` of this workspace is left at `q`."""
+    def build(self, problem: PostureProblem, q: np.ndarray, radius: float = 1.0) -> QP:
+        """The QP at `q`; `Kinematics` of this workspace is left at `q`.
+
+        Args:
+            problem: What is wanted.
+            q: (nq,).
+            radius: Share of the largest step that this step may take.
+        """
         kin, w = self.kin, self.world
         kin.update(q)
         soft, hard, ineq = self._soft, self._hard, self._ineq
@@ -285,7 +299,7 @@ class IK:
             diagonal[w.dadr] += weight
         H[np.diag_indices(nv)] += diagonal
 
-        lo, hi = -self._step.copy(), self._step.copy()
+        lo, hi = -radius * self._step, radius * self._step
         k = self._limited
         now = q[self._q_of_dof[k]]
         lo[k] = np.maximum(lo[k], w.q_min[k] - now)
@@ -329,14 +343,22 @@ class IK:
         iterations: int = 60,
         tolerance: float = 2e-3,
     ) -> Solution:
-        """Iterate from `q` until the step is below `tolerance` and all holds."""
-        n, converged = 0, False
+        """Iterate from `q` until the step is below `tolerance`.
+
+        A step that turns back on the one before has overshot: the next may go only half
+        as far; otherwise the reach grows again.
+        """
+        n, converged, radius = 0, False, 1.0
+        last = np.zeros(self.world.model.nv)
         for n in range(1, iterations + 1):
-            dq = self.step(self.build(problem, q))
+            dq = self.step(self.build(problem, q, radius))
             q = self.kin.integrate(q, dq)
             if np.abs(dq).max() < tolerance:
                 converged = True
                 break
+            turned = float(dq @ last) < -0.25 * float(np.linalg.norm(dq) * np.linalg.norm(last))
+            radius = max(0.5 * radius, 0.02) if turned else min(1.5 * radius, 1.0)
+            last = dq
         return Solution(
             q=q, iterations=n, residuals=self.residuals(problem, q), converged=converged
         )
@@ -350,7 +372,7 @@ class IK:
             if not g.hard:
                 continue
             s, support = w.surfaces[g.surface], w.supports[g.support]
-            p = kin.contact_point(g.surface, support.normal)
+            p = kin.contact_point(g.surface, support.normal, g.edge)
             if g.free:
                 error = abs(float(support.height(p)))
                 points = kin.bearing_points(g.surface, support.normal)
@@ -362,6 +384,9 @@ class IK:
                 turn = kin.flat_error(g.surface, g.rotation)
                 if g.free:
                     turn = turn - support.normal * (turn @ support.normal)
+                if g.edge is not None:
+                    axis = self._edge_axis(g)
+                    turn = turn - axis * (turn @ axis)
                 error = max(error, float(np.linalg.norm(turn)))
             contact = max(contact, error)
         near = kin.proximity(0.02, np.isfinite(problem.clearance))
@@ -386,7 +411,7 @@ class IK:
         kin = self.kin
         s, support = self.world.surfaces[g.surface], self.world.supports[g.support]
         n = support.normal
-        p = kin.contact_point(g.surface, n)
+        p = kin.contact_point(g.surface, n, g.edge)
         jac, rot = kin.jacobians(s.body, p)
         if s.radius > 0:
             # The touching point of a ball stays under its centre: it moves as that does.
@@ -395,6 +420,17 @@ class IK:
             self._target(jac, p - g.position, g.reference)
             if s.is_flat:
                 self._target(rot, -kin.flat_error(g.surface, g.rotation), 0.3 * g.reference)
+            return
+        if g.edge is not None:
+            turn = kin.flat_error(g.surface, g.rotation)
+            axis = self._edge_axis(g)
+            across = np.stack([n, np.cross(n, axis)])
+            k = self._hard.take(5)
+            self._hard.J[k.start : k.start + 3] = jac
+            self._hard.lo[k.start : k.start + 3] = _clip(g.position - p)
+            self._hard.J[k.start + 3 : k.stop] = across @ rot
+            self._hard.lo[k.start + 3 : k.stop] = _clip(across @ turn)
+            self._target(axis[None] @ rot, -(axis @ turn)[None], FLAT_WEIGHT)
             return
         if not g.free:
             m = 6 if s.is_flat else 3
@@ -428,6 +464,13 @@ class IK:
             J = jac.copy()
             J -= kin.point_jacobian(body, mass)
             self._target(J[:2], (p - mass)[:2], np.sqrt(2.0 * g.stability))
+
+    def _edge_axis(self, g: ContactGoal) -> np.ndarray:
+        """(3,) unit vector along the edge, where the surface lay flat."""
+        s = self.world.surface(g.surface, g.edge)
+        assert s.rotation is not None
+        along = g.rotation @ s.rotation.T @ (s.corners[1] - s.corners[0])
+        return along / np.linalg.norm(along)
 
     def _inside(self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray) -> None:
         room = b - EDGE_INSET - A @ p
@@ -472,7 +515,7 @@ class IK:
 
     def _polygon(self, problem: PostureProblem) -> np.ndarray:
         points = [
-            self.kin.bearing_points(g.surface, self.world.supports[g.support].normal)
+            self.kin.bearing_points(g.surface, self.world.supports[g.support].normal, g.edge)
             for g in problem.goals
             if g.hard and g.loaded
         ]

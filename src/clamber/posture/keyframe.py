@@ -11,7 +11,7 @@ posture that closes every contact, balanced and free of collisions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import Status
-from clamber.model import Kinematics, World, bearing_frames
+from clamber.model import Kinematics, World
 from clamber.posture.ik import (
     IK,
     ContactGoal,
@@ -139,6 +139,7 @@ def held_goal(world: World, c: Contact, *, loaded: bool = True) -> ContactGoal:
         position=c.position,
         rotation=support_rotation(world.supports[c.support], c.quaternion),
         loaded=loaded,
+        edge=c.edge,
     )
 
 
@@ -214,10 +215,25 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
     )
 
 
+def bearing_frames(
+    kin: Kinematics, contacts: Sequence[Contact]
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """Names, points (n, 3), normals (n, 3), friction (n,) of all bearing points."""
+    names, points, normals, mu = [], [], [], []
+    for c in contacts:
+        support = kin.world.supports[c.support]
+        p = kin.bearing_points(c.surface, support.normal, c.edge)
+        names += [c.surface] * len(p)
+        points.append(p)
+        normals.append(np.tile(support.normal, (len(p), 1)))
+        mu += [support.friction] * len(p)
+    return names, np.concatenate(points), np.concatenate(normals), np.array(mu)
+
+
 def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEquilibrium:
     """Static equilibrium with friction cones and torque limits at the present posture."""
     w = kin.world
-    names, points, normals, mu = bearing_frames(kin, [(c.surface, c.support) for c in contacts])
+    names, points, normals, mu = bearing_frames(kin, contacts)
     J = np.concatenate(
         [kin.point_jacobian(w.surfaces[n].body, p).copy() for n, p in zip(names, points, strict=True)]
     )
