@@ -1,4 +1,5 @@
 from clamber.contact import Contact as Contact
+from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
 from clamber.contact import Stance as Stance
 from clamber.demo import Demonstration as Demonstration
@@ -11,22 +12,30 @@ from clamber.errors import MissingDependency as MissingDependency
 from clamber.errors import Status as Status
 from clamber.io import load_plan as load_plan
 from clamber.io import load_sequence as load_sequence
+from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
 from clamber.io import save_rollout as save_rollout
 from clamber.io import save_sequence as save_sequence
 from clamber.io import save_verdict as save_verdict
+from clamber.model import Kinematics as Kinematics
 from clamber.model import Robot as Robot
+from clamber.model import World as World
+from clamber.model import build_world as build_world
+from clamber.model import limb_lengths as limb_lengths
 from clamber.model import load_robot as load_robot
 from clamber.pipeline import Plan as Plan
 from clamber.pipeline import PlanOptions as PlanOptions
 from clamber.pipeline import plan as plan
+from clamber.scene import Box as Box
 from clamber.scene import Scene as Scene
 from clamber.scene import Support as Support
 from clamber.scene import load_scene as load_scene
+from clamber.simulation import Criterion as Criterion
 from clamber.simulation import Rollout as Rollout
 from clamber.simulation import Verdict as Verdict
 from clamber.simulation import judge as judge
 from clamber.simulation import simulate as simulate
+from clamber.trajectory import Trajectory as Trajectory
 from clamber.viz import render_run as render_run
 
 __version__: str

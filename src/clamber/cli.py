@@ -1,0 +1,525 @@
+"""The command line: flags in, tables out.
+
+Every command is a dataclass whose fields are its flags and whose `run` calls the public
+functions in order, as `clamber.<name>`: those are imported on first use, so that
+`--help` answers at once. Progress goes to stderr, results to stdout.
+
+Exit codes: 0 the robot made it (or the command did its work), 1 it did not, 2 bad
+input, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io as text_io
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+import clamber
+from clamber.errors import ClamberError, InputError
+
+REACHED, MISSED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DEFAULT_HEIGHT = 0.275  # [m] of the box where no scene is given
+DESCRIPTION = (
+    "Turns a recording of a person climbing over an obstacle into a motion that a "
+    "humanoid robot executes in physics. Try: clamber climb --video"
+)
+Report = Callable[[str, float, str], None]
+
+
+def _default(module: str, record: str, name: str) -> Any:
+    """A field whose default is an options record's, looked up when it is needed."""
+    return field(
+        default_factory=lambda: getattr(
+            getattr(import_module(f"clamber.{module}"), record)(), name
+        )
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """How results are shown."""
+
+    json: bool = False
+    """Print the result as one JSON object."""
+    quiet: bool = False
+    """No progress, no table: files and exit code only."""
+
+    @contextlib.contextmanager
+    def progress(self) -> Iterator[Report]:
+        """Yield `report(stage, share done, note)`; it draws on stderr."""
+        console = Console(stderr=True)
+        if self.quiet:
+            yield lambda stage, done, note: None
+        elif console.is_terminal:
+            with _bars(console) as report:
+                yield report
+        else:
+            yield _lines(console)
+
+    def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
+        """Print one JSON object, or tables and a closing sentence, on stdout."""
+        if self.json:
+            sys.stdout.write(json.dumps({"version": 1, **record}) + "\n")
+        elif not self.quiet:
+            width = None if sys.stdout.isatty() else 100
+            console = Console(width=width, highlight=False, markup=False)
+            for table in tables:
+                console.print(table)
+            if note:
+                console.print(note, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def _bars(console: Console) -> Iterator[Report]:
+    """One bar for each stage, with its share and the time left."""
+    columns = (
+        TextColumn("{task.description:<10}"),
+        BarColumn(bar_width=24),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks = {}
+
+        def report(stage: str, done: float, note: str) -> None:
+            if stage not in tasks:
+                for earlier in tasks.values():
+                    bars.update(earlier, completed=1.0, note="")
+                tasks[stage] = bars.add_task(stage, total=1.0, note=note)
+            bars.update(tasks[stage], completed=done, note=note)
+
+        yield report
+        for task in tasks.values():
+            bars.update(task, completed=1.0, note="")
+
+
+def _lines(console: Console) -> Report:
+    """One line for each tenth of a stage, for logs."""
+    shown: dict[str, int] = {}
+
+    def report(stage: str, done: float, note: str) -> None:
+        tenth = int(10 * done)
+        if shown.get(stage, -1) < tenth:
+            shown[stage] = tenth
+            line = f"{stage} {100 * done:3.0f} % {note}".rstrip()
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    return report
+
+
+Flat = tyro.conf.OmitArgPrefixes
+Printed = Annotated[Output, Flat]
+Place = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """Which robot, and where."""
+
+    robot: str = "coman"
+    """A built-in robot by name, or a robot.yaml."""
+    height: Annotated[
+        float | None,
+        tyro.conf.arg(
+            metavar="METRES", help_behavior_hint=f"(default: {DEFAULT_HEIGHT})"
+        ),
+    ] = None
+    """One box of 1.0 x 1.2 m with this height, 0.23 m before the ankles."""
+    scene: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
+    ] = None
+    """A scene.yaml."""
+
+    def load(self) -> tuple[clamber.Robot, clamber.Scene]:
+        """Robot and scene, the scene first checked as the cheaper one."""
+        scene = _scene(self.height, self.scene)
+        return clamber.load_robot(self.robot), scene
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planning:
+    """How to plan."""
+
+    method: Literal["direct", "lbfgs", "gradient"] = _default(
+        "pipeline", "PlanOptions", "method"
+    )
+    """How contact positions are optimised."""
+    speed: Annotated[float, tyro.conf.arg(metavar="RAD/S")] = _default(
+        "pipeline", "PlanOptions", "speed"
+    )
+    """Largest joint speed."""
+
+
+def _scene(height: float | None, path: Path | None) -> clamber.Scene:
+    """The scene of a file, or the one box of `--height`."""
+    import pydantic
+
+    from clamber.scene import input_error
+
+    if path is not None:
+        if height is not None:
+            raise InputError("--height or --scene, not both")
+        return clamber.load_scene(path)
+    height = DEFAULT_HEIGHT if height is None else height
+    try:
+        return clamber.Scene.from_height(height)
+    except pydantic.ValidationError as e:
+        expected = input_error(e, None).expected
+        raise InputError(expected, source="--height", value=height) from e
+
+
+@dataclass(frozen=True, kw_only=True)
+class Climb:
+    """The whole job: detect contacts, plan, simulate; all files in one run folder."""
+
+    demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
+    """A recording, or a built-in demonstration: climb, crossing."""
+    world: Annotated[World, Flat]
+    planning: Annotated[Planning, Flat]
+    video: bool = False
+    """Draw pictures and a video of what physics did."""
+    out: Place = None
+    """The run folder (runs/climb, then runs/climb-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Recording to verdict."""
+        robot, scene = self.world.load()
+        with self.output.progress() as report:
+            report("detect", 0.0, "")
+            sequence = clamber.detect_contacts(clamber.load_demo(self.demo))
+            folder = clamber.new_run_folder(self.out, "climb")
+            clamber.save_sequence(sequence, folder / "sequence.json")
+            plan = _plan(sequence, robot, scene, self.planning, folder, report)
+            if plan.trajectory is None:
+                verdict = None
+            else:
+                verdict = _simulate(plan, folder, report)
+                if self.video:
+                    _render(folder, report)
+        return _conclude(self.output, folder, plan, verdict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contacts:
+    """Find the contacts in a recording, at the person's scale: sequence.json."""
+
+    recording: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """A recording, recording.yaml, or a built-in demonstration by name."""
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The scene.yaml it was recorded in, where the recording has none."""
+    out: Place = None
+    """The run folder (runs/contacts, then runs/contacts-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Recording to contact sequence."""
+        scene = None if self.scene is None else clamber.load_scene(self.scene)
+        with self.output.progress() as report:
+            report("detect", 0.0, "")
+            sequence = clamber.detect_contacts(
+                clamber.load_demo(self.recording, scene=scene)
+            )
+            folder = clamber.new_run_folder(self.out, "contacts")
+            clamber.save_sequence(sequence, folder / "sequence.json")
+        table = _table("stance", "region", "from [s]", "to [s]", "contacts")
+        for i, stance in enumerate(sequence.stances):
+            on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
+            t0, t1 = sequence.t[i], sequence.t[i + 1]
+            table.add_row(str(i), stance.region, f"{t0:.2f}", f"{t1:.2f}", on)
+        record = {"out": str(folder), "stances": len(sequence.stances)}
+        self.output.show(record, table, note=f"the sequence is in {folder}")
+        return REACHED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Plan a contact sequence for a robot and a scene: plan, trajectory, scene.xml."""
+
+    sequence: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE")]
+    """A sequence.json."""
+    world: Annotated[World, Flat]
+    planning: Annotated[Planning, Flat]
+    out: Place = None
+    """The run folder (runs/plan, then runs/plan-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Contact sequence to trajectory."""
+        sequence = clamber.load_sequence(self.sequence)
+        robot, scene = self.world.load()
+        with self.output.progress() as report:
+            folder = clamber.new_run_folder(self.out, "plan")
+            plan = _plan(sequence, robot, scene, self.planning, folder, report)
+        table = _table("keyframe", "contacts", "CoM margin [m]")
+        for i, key in enumerate(plan.keyframes):
+            on = ", ".join(f"{c.surface} on {c.support}" for c in key.stance)
+            table.add_row(str(i), on, f"{key.com_margin:.3f}")
+        record = {"out": str(folder), **_plan_record(plan)}
+        self.output.show(
+            record, table, *_skipped(plan), note=f"the plan is in {folder}"
+        )
+        return REACHED if plan.complete else MISSED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate:
+    """Run a plan in physics: rollout.npz, verdict.json."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder that holds a plan."""
+    output: Printed
+
+    def run(self) -> int:
+        """Plan to verdict."""
+        plan = clamber.load_plan(self.run_folder)
+        with self.output.progress() as report:
+            verdict = _simulate(plan, self.run_folder, report)
+        return _conclude(self.output, self.run_folder, plan, verdict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render:
+    """Draw pictures and a video of a run."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder that holds a rollout."""
+    output: Printed
+
+    def run(self) -> int:
+        """Rollout to pictures."""
+        with self.output.progress() as report:
+            files = _render(self.run_folder, report)
+        names = [str(f) for f in files]
+        self.output.show({"files": names}, note="\n".join(names))
+        return REACHED
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneCommand:
+    """Check a scene file and say what is in it."""
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """A scene.yaml."""
+    output: Printed
+
+    def run(self) -> int:
+        """Scene file to a table of its supports."""
+        scene = clamber.load_scene(self.file)
+        table = _table("support", "centre [m]", "slope [rad]", "friction")
+        supports = []
+        for s in scene.supports:
+            centre = [round(float(x), 6) for x in s.position]
+            slope = math.acos(min(1.0, float(s.normal[2])))
+            supports.append({"name": s.name, "centre": centre, "friction": s.friction})
+            text = " ".join(f"{x:.3f}" for x in centre)
+            table.add_row(s.name, text, f"{slope:.3f}", f"{s.friction:g}")
+        self.output.show({"supports": supports}, table)
+        return REACHED
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotCommand:
+    """Check a robot: load it, stand it up and say what a planner sees of it."""
+
+    action: tyro.conf.Positional[Literal["check"]]
+    """What to do with it."""
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    """A built-in robot by name, or a robot.yaml."""
+    output: Printed
+
+    def run(self) -> int:
+        """Robot file to a table of its limbs."""
+        import numpy as np
+
+        robot = clamber.load_robot(self.model)
+        world = clamber.build_world(robot, clamber.Scene(start=np.zeros(3)))
+        kin = clamber.Kinematics(world)
+        kin.update(world.home)
+        table = _table("limb", "from", "to", "surfaces")
+        for limb in robot.limbs.values():
+            table.add_row(limb.name, limb.root, limb.end, ", ".join(limb.surfaces))
+        segments = {k: round(v, 4) for k, v in clamber.limb_lengths(kin).items()}
+        record = {
+            "name": robot.name,
+            "mass": round(world.mass, 4),
+            "joints": len(world.joints),
+            "surfaces": list(robot.surfaces),
+            "segments": segments,
+            "com_height": round(float(kin.com[2]), 4),
+        }
+        lengths = ", ".join(f"{k} {v:.3f} m" for k, v in segments.items())
+        note = (
+            f"{robot.name}: {world.mass:.2f} kg, {len(world.joints)} actuated joints, "
+            f"CoM {kin.com[2]:.3f} m high as it stands; {lengths}"
+        )
+        self.output.show(record, table, note=note)
+        return REACHED
+
+
+Command = (
+    Annotated[Climb, tyro.conf.subcommand("climb")]
+    | Annotated[Contacts, tyro.conf.subcommand("contacts")]
+    | Annotated[Plan, tyro.conf.subcommand("plan")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
+    | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
+)
+
+
+def _plan(
+    sequence: clamber.ContactSequence,
+    robot: clamber.Robot,
+    scene: clamber.Scene,
+    flags: Planning,
+    folder: Path,
+    report: Report,
+) -> clamber.Plan:
+    """Plan and save."""
+    options = clamber.PlanOptions(**asdict(flags))
+    result = clamber.plan(sequence, robot, scene, options=options, progress=report)
+    clamber.save_plan(result, folder)
+    return result
+
+
+def _simulate(plan: clamber.Plan, folder: Path, report: Report) -> clamber.Verdict:
+    """Simulate, judge and save."""
+    rollout = clamber.simulate(plan, progress=report)
+    clamber.save_rollout(rollout, folder)
+    verdict = clamber.judge(plan, rollout)
+    clamber.save_verdict(verdict, folder)
+    return verdict
+
+
+def _render(folder: Path, report: Report) -> list[Path]:
+    """Draw."""
+    report("render", 0.0, "")
+    return clamber.render_run(folder)
+
+
+def _table(*columns: str) -> Table:
+    table = Table(*columns, box=None, header_style="bold", pad_edge=False)
+    table.columns[-1].overflow = "fold"
+    return table
+
+
+def _plan_record(plan: clamber.Plan) -> dict[str, Any]:
+    """What `--json` says of a plan."""
+    skipped = [{"stance": s.stance, "reason": s.reason} for s in plan.skipped]
+    return {
+        "complete": plan.complete,
+        "keyframes": len(plan.keyframes),
+        "skipped": skipped,
+    }
+
+
+def _skipped(plan: clamber.Plan) -> list[Table]:
+    """A table of the stances left out, where there are any."""
+    if not plan.skipped:
+        return []
+    table = _table("skipped stance", "because")
+    for s in plan.skipped:
+        table.add_row(str(s.stance), s.reason)
+    return [table]
+
+
+def _conclude(
+    output: Output, folder: Path, plan: clamber.Plan, verdict: clamber.Verdict | None
+) -> int:
+    """Show the verdict and where the files are; the exit code says the same."""
+    table = _table("criterion", "value", "limit", "")
+    criteria = {} if verdict is None else verdict.criteria
+    for name, c in criteria.items():
+        table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
+    reached = verdict is not None and verdict.reached
+    if verdict is None:
+        note = "no move of the sequence could be planned"
+    else:
+        note = "the robot made it" if reached else "the robot did not make it"
+    record = {
+        "out": str(folder),
+        "reached": reached,
+        "criteria": {
+            n: {"value": c.value, "limit": c.limit, "ok": c.ok}
+            for n, c in criteria.items()
+        },
+        **_plan_record(plan),
+    }
+    tables = [*_skipped(plan), table] if criteria else _skipped(plan)
+    output.show(record, *tables, note=f"{note}: the files are in {folder}")
+    return REACHED if reached else MISSED
+
+
+def _parse(args: Sequence[str]) -> Any:
+    """Flags to a command; a wrong flag becomes one sentence instead of a box."""
+    captured = text_io.StringIO()
+    try:
+        with contextlib.redirect_stderr(captured):
+            return tyro.cli(
+                Command,
+                prog="clamber",
+                description=DESCRIPTION,
+                args=list(args),
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as e:
+        if e.code not in (0, None):
+            raise InputError(_sentence(captured.getvalue())) from e
+        raise
+
+
+def _sentence(box: str) -> str:
+    """The text of an error box, up to its first rule, on one line."""
+    rows = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
+    text = []
+    for row in rows:
+        if row and not row.strip("─"):
+            break
+        text.append(row)
+    words = " ".join(" ".join(text).split())
+    wrong = re.match(r"(.*): no type matching (.*) could be .* from (.*?)\.", words)
+    if wrong:
+        flag, kind, value = wrong.groups()
+        words = f"{flag}: {value}, expected {kind.removeprefix('{None}|')}"
+    return words or "flags as in --help"
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    argv = list(sys.argv[1:] if args is None else args)
+    if "--version" in argv:
+        sys.stdout.write(f"clamber {clamber.__version__}\n")
+        return REACHED
+    lead = [a for a in argv[:2] if a in ("--json", "--quiet")]
+    if argv[: len(lead)] == lead:  # also before the command
+        argv = argv[len(lead) :] + lead
+    try:
+        return _parse(argv).run()
+    except ClamberError as e:
+        sys.stderr.write(f"clamber: {e}\n")
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        sys.stderr.write("clamber: interrupted; the files written so far are whole\n")
+        return INTERRUPTED

@@ -1,0 +1,62 @@
+"""What tests share: a seeded generator, finite differences, a toy world, recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# A cart on a rail with a swinging, weighted arm over a box: two joints, three geoms.
+TOY = """
+<mujoco model="toy">
+  <worldbody>
+    <geom name="ground" type="plane" size="0 0 0.05"/>
+    <geom name="box" type="box" size="0.2 0.2 0.1" pos="0.6 0 0.1"/>
+    <body name="cart" pos="0 0 0.5">
+      <joint name="rail" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
+      <geom name="cart" type="box" size="0.1 0.1 0.05" mass="2"/>
+      <body name="arm" pos="0.1 0 0">
+        <joint name="swing" type="hinge" axis="0 1 0" range="-2 2" limited="true"/>
+        <geom name="arm" type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="1"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20)
+
+
+@pytest.fixture
+def toy_mjcf() -> str:
+    return TOY
+
+
+@pytest.fixture
+def finite_difference() -> Callable[..., np.ndarray]:
+    """`finite_difference(f, x)`: central differences, a column per entry of x."""
+
+    def difference(f, x, step: float = 1e-6) -> np.ndarray:
+        x = np.asarray(x, dtype=float)
+        columns = []
+        for e in np.eye(x.size) * step:
+            columns.append((np.asarray(f(x + e)) - np.asarray(f(x - e))) / (2 * step))
+        return np.stack(columns, axis=-1)
+
+    return difference
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Recordings beside a checkout, which the repository does not carry."""
+    folder = ROOT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("no folder of recordings beside the repository")
+    return folder

@@ -1,0 +1,193 @@
+"""The command line as a person meets it: help, version, results, mistakes."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+from rich.console import Console
+
+import clamber
+from clamber import cli
+
+COMMANDS = ("climb", "contacts", "plan", "simulate", "render", "scene", "robot")
+
+
+def run(*args: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "import sys; from clamber.cli import main"]
+    command[-1] += "; sys.exit(main())"
+    words = [str(a) for a in args]
+    return subprocess.run([*command, *words], capture_output=True, text=True)
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "boxes:\n- {name: table, size: [0.95, 0.6, 0.275], position: [0.705, 0.0]}\n"
+    )
+    return path
+
+
+def test_help_names_every_command_without_loading_the_planner():
+    start = time.perf_counter()
+    code = "import sys; from clamber.cli import main\ntry:\n  main(['--help'])\n"
+    code += "finally:\n  print('LOADED', *sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert time.perf_counter() - start < 10.0
+    text, loaded = out.stdout.split("LOADED")
+    assert not {"mujoco", "numpy", "scipy", "clamber.pipeline"} & set(loaded.split())
+    for name in COMMANDS:
+        assert name in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([name, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert f"clamber {name}" in text
+    assert "--json" in text
+    assert "--quiet" in text
+
+
+@pytest.mark.parametrize("args", [["--version"], ["climb", "--version"]])
+def test_version_is_that_of_the_package(
+    args: list[str], capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(args) == 0
+    assert capsys.readouterr().out == f"clamber {clamber.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        ([], "climb, contacts, plan"),
+        (["nonsense"], "nonsense"),
+        (["plan"], "SEQUENCE"),
+        (["climb", "--height", "abc"], "'abc'], expected FLOAT"),
+        (["climb", "--speed", "fast"], "--speed"),
+        (["climb", "--method", "luck"], "'direct', 'lbfgs', 'gradient'"),
+        (["climb", "--height", "-1"], "--height is -1.0; expected a positive length"),
+        (["climb", "--height", "nan"], "--height is nan; expected a finite number"),
+        (["climb", "--robot", "nobody"], "--robot is 'nobody'; expected a robot.yaml"),
+        (["climb", "--scene", "no.yaml"], "no.yaml expected a readable file"),
+        (["climb", "--scene", "a.yaml", "--height", "1"], "not both"),
+        (["scene", "no.yaml"], "no.yaml expected a readable file"),
+        (["robot", "check", "nobody.urdf"], "expected a robot.yaml"),
+    ],
+)
+def test_a_mistake_is_one_sentence_on_stderr_and_exit_2(
+    args: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(args) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert err.startswith("clamber: ")
+    assert said in err
+    assert "Traceback" not in err
+
+
+def test_the_process_ends_with_the_exit_code():
+    out = run("scene", "nowhere.yaml")
+    assert out.returncode == 2
+    assert out.stderr.startswith("clamber: nowhere.yaml")
+
+
+def test_a_wrong_field_of_a_scene_is_named(
+    scene_file: Path, capsys: pytest.CaptureFixture[str]
+):
+    scene_file.write_text(scene_file.read_text().replace("0.275", "-0.275"))
+    assert cli.main(["scene", str(scene_file)]) == 2
+    err = capsys.readouterr().err
+    for word in (str(scene_file), "boxes.0.size.2", "-0.275", "positive length"):
+        assert word in err
+
+
+def test_json_is_one_object_with_the_figures_of_the_table(
+    scene_file: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["scene", str(scene_file), "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["version"] == 1
+    assert [s["name"] for s in record["supports"]] == ["ground", "table"]
+    assert record["supports"][1]["centre"] == [0.705, 0.0, 0.275]
+    assert cli.main(["scene", str(scene_file)]) == 0
+    table = capsys.readouterr().out
+    assert "0.705 0.000 0.275" in table
+    assert "centre [m]" in table
+
+
+def test_json_and_quiet_may_also_stand_before_the_command(
+    scene_file: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["--json", "scene", str(scene_file)]) == 0
+    assert json.loads(capsys.readouterr().out)["version"] == 1
+    assert cli.main(["--quiet", "scene", str(scene_file)]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_the_built_in_robot_passes_its_check(capsys: pytest.CaptureFixture[str]):
+    assert cli.main(["robot", "check", "coman", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["mass"] == pytest.approx(28.89, abs=0.05)
+    assert record["joints"] == 23
+    assert set(record["surfaces"]) == {
+        side + part for side in "LR" for part in ("Hand", "Elbow", "Knee", "Foot")
+    }
+
+
+def test_an_interrupt_is_one_sentence_and_exit_130(
+    scene_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    def interrupt(self: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.SceneCommand, "run", interrupt)
+    assert cli.main(["scene", str(scene_file)]) == 130
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_flags_of_planning_are_fields_of_its_options():
+    from clamber.pipeline import Method, PlanOptions
+
+    flags, options = cli.Planning(), PlanOptions()
+    for f in fields(cli.Planning):
+        assert getattr(flags, f.name) == getattr(options, f.name)
+    shown = get_type_hints(cli.Planning)["method"]
+    assert get_args(shown) == get_args(Method)
+
+
+def test_progress_on_a_log_is_one_line_for_each_tenth():
+    log = io.StringIO()
+    report = cli._lines(Console(file=log, width=80))
+    for k in range(200):
+        report("plan", k / 200, f"move {k}")
+    report("simulate", 1.0, "")
+    lines = log.getvalue().splitlines()
+    assert len(lines) == 11
+    assert lines[0] == "plan   0 % move 0"
+    assert lines[-1] == "simulate 100 %"
+
+
+def test_progress_on_a_terminal_shows_stage_share_and_time_left():
+    screen = io.StringIO()
+    console = Console(file=screen, width=100, force_terminal=True)
+    with cli._bars(console) as report:
+        report("plan", 0.0, "LHand")
+        report("plan", 0.5, "[RHand]")
+        report("simulate", 0.2, "")
+    text = screen.getvalue()
+    for word in ("plan", "simulate", "100%", "0:00:00"):
+        assert word in text
