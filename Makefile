@@ -44,7 +44,7 @@ bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same 
 	@for f in benchmarks/*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
 
 docs: $(VENV)/.has-docs ## the documentation as a web site, into site/
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open site/index.html"
 
 build: $(VENV)/.has-dev ## wheel and sdist into dist/, tried out in an empty environment
