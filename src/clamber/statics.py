@@ -350,10 +350,11 @@ class StaticEquilibrium:
             through the centre of mass, that the stance holds in every direction.
             Negative: the least steady push without which it falls; -1 where no push up
             to the weight helps. At most 1.
-        limiting: The contact or joint that limits it: the one that gains most in the
-            weakest direction if its forces may leave the cone by the weight, or its
-            torque may exceed the limit by as much again. Where the robot tips over,
-            that is the contact which would have to pull. None where nothing limits.
+        limiting: The contact or joint that limits it: in the motion with which the
+            stance gives way to the weakest push, the one that yields fastest (m/s of a
+            contact, rad/s of a joint; the duals of the LP). A slipping contact; where
+            the robot tips over, the one that lifts off and would have to pull; a joint
+            whose torque does not suffice. None where nothing limits.
         forces: (nc, 3) least contact forces for the posture as it is [N].
         torques: (na,) joint torques with these forces [N m]; None without limits.
     """
@@ -555,14 +556,14 @@ def static_equilibrium(
     margin, limiting = -PUSH_LIMIT, None
     if len(points):
         lp = _build_push_lp(points, normals, mu, com, mass, cone_edges, torque)
-        margin, shares = _push_margin(lp)
+        margin, duals = _push_margin(lp)
         owners = [n for n in names for _ in range(cone_edges)]
         owners += () if torque is None else [*torque.names, *torque.names]
-        gains: dict[str, float] = {}
-        for name, share in zip(owners, shares.tolist(), strict=True):
-            gains[name] = gains.get(name, 0.0) + share
-        best = max(gains, key=lambda name: gains[name])
-        limiting = best if gains[best] > 1e-9 else None
+        yields: dict[str, float] = {}
+        for name, dual in zip(owners, duals.tolist(), strict=True):
+            yields[name] = max(yields.get(name, 0.0), dual)
+        best = max(yields, key=lambda name: yields[name])
+        limiting = best if yields[best] > 1e-9 else None
     return StaticEquilibrium(
         feasible=margin >= -PUSH_TOL,
         margin=margin,
@@ -580,7 +581,6 @@ class _PushLP:
     b_eq: np.ndarray
     A_ub: np.ndarray
     b_ub: np.ndarray
-    relaxation: np.ndarray  # of a row of A_ub: the joint's limit [weights m]
 
 
 def _build_push_lp(
@@ -600,7 +600,6 @@ def _build_push_lp(
     A_eq[:, :n] = _wrenches(r, E.reshape(n, 3)).T
     A_eq[0, n] = A_eq[1, n + 1] = 1.0
     A_ub, b_ub = np.zeros((0, n + 2)), np.zeros(0)
-    relaxation = np.zeros(0)
     if torque is not None:
         na = len(torque.dofs)
         J = torque.jacobian[:, torque.dofs].T.reshape(na, len(points), 1, 3)
@@ -610,19 +609,18 @@ def _build_push_lp(
         limits = np.concatenate([torque.limits, torque.limits]) / weight
         A_ub = np.concatenate([load, -load])
         b_ub = np.concatenate([g, -g]) / weight + limits
-        relaxation = np.maximum(limits, 1e-3)
-    return _PushLP(A_eq=A_eq, b_eq=_WEIGHT, A_ub=A_ub, b_ub=b_ub, relaxation=relaxation)
+    return _PushLP(A_eq=A_eq, b_eq=_WEIGHT, A_ub=A_ub, b_ub=b_ub)
 
 
 def _push_margin(lp: _PushLP) -> tuple[float, np.ndarray]:
-    """Margin [weights] and how much each cone edge and torque row limits it."""
+    """Margin [weights] and the duals of the cone edges and torque rows there."""
     n = lp.A_eq.shape[1] - 2
     bounds = np.concatenate(
         [np.tile([0.0, np.inf], (n, 1)), np.tile([-PUSH_LIMIT, PUSH_LIMIT], (2, 1))]
     )
     found: list[np.ndarray] = []
     queue = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
-    inner, out, shares = -math.inf, queue[0], np.zeros(n + len(lp.b_ub))
+    inner, out, duals = -math.inf, queue[0], np.zeros(n + len(lp.b_ub))
     for _ in range(60):
         u = np.array(queue.pop() if queue else out)
         cost = np.zeros(n + 2)
@@ -631,19 +629,18 @@ def _push_margin(lp: _PushLP) -> tuple[float, np.ndarray]:
             cost, lp.A_ub, lp.b_ub, lp.A_eq, lp.b_eq, bounds=bounds, method="highs"
         )
         if result.x is None:  # no push up to the weight helps
-            return -PUSH_LIMIT, _unbalanced_shares(lp)
+            return -PUSH_LIMIT, _unbalanced_duals(lp)
         push = result.x[n:]
-        torque_shares = -result.ineqlin.marginals * lp.relaxation
-        shares = np.concatenate([result.lower.marginals[:n], torque_shares])
+        duals = np.append(result.lower.marginals[:n], -result.ineqlin.marginals)
         if not queue and len(found) >= 4 and u @ push <= inner + PUSH_TOL:
             break
         found.append(push)
         polygon = support_polygon(np.array(found))
         inner, out = _border(0.0, 0.0, polygon.tolist())
-    return max(-PUSH_LIMIT, min(PUSH_LIMIT, float(inner))), shares
+    return max(-PUSH_LIMIT, min(PUSH_LIMIT, float(inner))), duals
 
 
-def _unbalanced_shares(lp: _PushLP) -> np.ndarray:
+def _unbalanced_duals(lp: _PushLP) -> np.ndarray:
     """What limits a stance that no push can hold: least squares instead of a push."""
     n, ns = lp.A_eq.shape[1] - 2, len(lp.A_eq) + len(lp.A_ub)
     A = np.zeros((ns, n + ns))
@@ -657,4 +654,4 @@ def _unbalanced_shares(lp: _PushLP) -> np.ndarray:
     H = np.diag(np.concatenate([np.full(n, 1e-8), np.ones(ns)]))
     info = daqp.solve(H, np.zeros(n + ns), A, upper, lower, sense)[3]
     lam = np.abs(info["lam"])
-    return np.concatenate([lam[:n], lam[n + ns + 6 :] * lp.relaxation])
+    return np.append(lam[:n], lam[n + ns + 6 :])

@@ -1,0 +1,92 @@
+"""Time of one balance test of a stance, here and in Klampt, on the same stances.
+
+    python benchmarks/bench_statics.py
+
+Both are given points, normals, friction and centre of mass afresh each time, build
+pyramids with the same edges inside the friction cones, and answer whether forces within
+them balance gravity. Also times the other functions of `clamber.statics`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from clamber.statics import (
+    com_margin,
+    contact_forces,
+    is_statically_stable,
+    polygon_halfplanes,
+    static_equilibrium,
+    support_ellipse,
+    support_polygon,
+)
+
+STANCES = 1000
+MASS = 30.0  # [kg]
+
+StanceArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def random_stance(rng: np.random.Generator) -> StanceArrays:
+    """2 to 8 points, tilted normals, mu from 0.2 to 1, a centre of mass near."""
+    nc = int(rng.integers(2, 9))
+    points = rng.uniform(-0.4, 0.4, (nc, 3)) * [1.0, 1.0, 0.5]
+    normals = np.c_[rng.normal(0.0, 0.35, (nc, 2)), np.ones(nc)]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    com = np.append(points[:, :2].mean(axis=0) + rng.normal(0.0, 0.08, 2), 0.5)
+    return points, normals, rng.uniform(0.2, 1.0, nc), com
+
+
+def timed(job: Callable, inputs: Sequence) -> tuple[float, list]:
+    """Median time of a call [us], and all the results."""
+    took, results = [], []
+    for x in inputs:
+        start = time.perf_counter()
+        result = job(x)
+        took.append(time.perf_counter() - start)
+        results.append(result)
+    return 1e6 * float(np.median(took)), results
+
+
+def main() -> None:
+    rng = np.random.default_rng(0)
+    stances = [random_stance(rng) for _ in range(STANCES)]
+    print(f"{STANCES} stances of 2 to 8 points; median time of a call")
+    for edges in (4, 8):
+        ours, verdicts = timed(
+            lambda s, m=edges: is_statically_stable(*s, cone_edges=m), stances
+        )
+        print(f"balance test, {edges} edges: clamber {ours:8.1f} us", end="")
+        try:
+            from klampt import robotsim
+        except ImportError:
+            print("   (pip install klampt compares)")
+            continue
+        robotsim.set_friction_cone_approximation_edges(edges)
+        inputs = [(np.c_[p, n, mu], tuple(com)) for p, n, mu, com in stances]
+        theirs, answers = timed(
+            lambda s: robotsim.com_equilibrium(s[0], (0, 0, -1), s[1]), inputs
+        )
+        same = sum(a == (b is not None) for a, b in zip(verdicts, answers, strict=True))
+        print(f"   Klampt {theirs:8.1f} us   {same} of {STANCES} agree")
+
+    few = stances[:100]
+    us, _ = timed(lambda s: contact_forces(*s, MASS), stances)
+    print(f"contact_forces:            {us:8.1f} us")
+    us, _ = timed(lambda s: static_equilibrium(*s, MASS, names=[""] * len(s[0])), few)
+    print(f"static_equilibrium:        {us:8.1f} us")
+    clouds = [rng.uniform(-0.4, 0.4, (16, 2)) for _ in range(STANCES)]
+    us, polygons = timed(support_polygon, clouds)
+    print(f"support_polygon, 16 points: {us:7.1f} us")
+    for job in (polygon_halfplanes, support_ellipse):
+        us, _ = timed(job, polygons)
+        print(f"{job.__name__ + ':':27}{us:8.1f} us")
+    us, _ = timed(lambda v: com_margin((0.0, 0.0), v), polygons)
+    print(f"com_margin:                {us:8.1f} us")
+
+
+if __name__ == "__main__":
+    main()
