@@ -162,10 +162,10 @@ def test_an_interrupt_is_one_sentence_and_exit_130(
 def test_the_flags_of_planning_are_fields_of_its_options():
     from clamber.pipeline import Method, PlanOptions
 
-    flags, options = cli.Planning(), PlanOptions()
-    for f in fields(cli.Planning):
+    flags, options = cli.PlanningFlags(), PlanOptions()
+    for f in fields(cli.PlanningFlags):
         assert getattr(flags, f.name) == getattr(options, f.name)
-    shown = get_type_hints(cli.Planning)["method"]
+    shown = get_type_hints(cli.PlanningFlags)["method"]
     assert get_args(shown) == get_args(Method)
 
 

@@ -133,7 +133,7 @@ Place = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class World:
+class WorldFlags:
     """Which robot, and where."""
 
     robot: str = "coman"
@@ -158,7 +158,7 @@ class World:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planning:
+class PlanningFlags:
     """How to plan."""
 
     method: Literal["direct", "lbfgs", "gradient"] = _default(
@@ -190,13 +190,13 @@ def _scene(height: float | None, path: Path | None) -> clamber.Scene:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Climb:
+class ClimbCommand:
     """The whole job: detect contacts, plan, simulate; all files in one run folder."""
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
     """A recording, or a built-in demonstration: climb, crossing."""
-    world: Annotated[World, Flat]
-    planning: Annotated[Planning, Flat]
+    world: Annotated[WorldFlags, Flat]
+    planning: Annotated[PlanningFlags, Flat]
     video: bool = False
     """Draw pictures and a video of what physics did."""
     out: Place = None
@@ -222,7 +222,7 @@ class Climb:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contacts:
+class ContactsCommand:
     """Find the contacts in a recording, at the person's scale: sequence.json."""
 
     recording: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
@@ -254,13 +254,13 @@ class Contacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class PlanCommand:
     """Plan a contact sequence for a robot and a scene: plan, trajectory, scene.xml."""
 
     sequence: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE")]
     """A sequence.json."""
-    world: Annotated[World, Flat]
-    planning: Annotated[Planning, Flat]
+    world: Annotated[WorldFlags, Flat]
+    planning: Annotated[PlanningFlags, Flat]
     out: Place = None
     """The run folder (runs/plan, then runs/plan-2 ...)."""
     output: Printed
@@ -284,7 +284,7 @@ class Plan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate:
+class SimulateCommand:
     """Run a plan in physics: rollout.npz, verdict.json."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -300,7 +300,7 @@ class Simulate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Render:
+class RenderCommand:
     """Draw pictures and a video of a run."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -379,11 +379,11 @@ class RobotCommand:
 
 
 Command = (
-    Annotated[Climb, tyro.conf.subcommand("climb")]
-    | Annotated[Contacts, tyro.conf.subcommand("contacts")]
-    | Annotated[Plan, tyro.conf.subcommand("plan")]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
+    Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
+    | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
+    | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
+    | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
 )
@@ -393,7 +393,7 @@ def _plan(
     sequence: clamber.ContactSequence,
     robot: clamber.Robot,
     scene: clamber.Scene,
-    flags: Planning,
+    flags: PlanningFlags,
     folder: Path,
     report: Report,
 ) -> clamber.Plan:
