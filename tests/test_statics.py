@@ -505,6 +505,39 @@ def test_where_the_robot_tips_over_the_contact_that_had_to_pull_limits():
     assert verdict.limiting == "left"
 
 
+def test_balancing_on_one_point_has_no_margin_and_names_the_pivot():
+    points, normals, mu = flat(np.zeros((1, 2)), 0.5)
+    above = static_equilibrium(points, normals, mu, 0.5 * UP, MASS, names=["hand"])
+    assert above.feasible
+    assert above.margin == pytest.approx(0.0, abs=1e-6)
+    beside = np.array([0.05, 0.0, 0.5])
+    verdict = static_equilibrium(points, normals, mu, beside, MASS, names=["hand"])
+    assert verdict.margin == pytest.approx(-0.1, abs=1e-6)  # leans back by 0.05 / 0.5
+    assert above.limiting == verdict.limiting == "hand"
+
+
+def test_a_stance_that_holds_any_push_is_limited_by_nothing():
+    """Six faces that grip: four walls around, floor and ceiling."""
+    directions = np.r_[np.eye(3), -np.eye(3)]
+    points = np.repeat(-0.3 * directions, 4, axis=0)
+    for i, d in enumerate(directions):
+        points[4 * i : 4 * i + 4] += (
+            0.05
+            * np.c_[SQUARE, np.zeros(4)]
+            @ np.array([np.roll(np.abs(d), 1), np.roll(np.abs(d), 2), d])
+        )
+    verdict = static_equilibrium(
+        points,
+        np.repeat(directions, 4, axis=0),
+        np.full(24, 0.5),
+        np.zeros(3),
+        MASS,
+        names=["wall"] * 24,
+    )
+    assert verdict.margin == pytest.approx(1.0)
+    assert verdict.limiting is None
+
+
 # Contact forces.
 
 

@@ -333,7 +333,8 @@ class ContactForces:
         forces: (nc, 3) on the robot, in the world frame, within the cones [N].
         residual: Norm of what they leave unbalanced, in weights (moments: in weights
             times a metre; joint torques beyond their limits included). Up to
-            `BALANCE_TOL` where the stance holds.
+            `BALANCE_TOL` where the stance holds with forces of the order of the weight;
+            more where it must jam itself between walls with many times that.
     """
 
     forces: np.ndarray
@@ -354,7 +355,8 @@ class StaticEquilibrium:
             stance gives way to the weakest push, the one that yields fastest (m/s of a
             contact, rad/s of a joint; the duals of the LP). A slipping contact; where
             the robot tips over, the one that lifts off and would have to pull; a joint
-            whose torque does not suffice. None where nothing limits.
+            whose torque does not suffice; the pivot where nothing else moves. None
+            where a push of the whole weight is held.
         forces: (nc, 3) least contact forces for the posture as it is [N].
         torques: (na,) joint torques with these forces [N m]; None without limits.
     """
@@ -422,6 +424,7 @@ def _wrenches(r: np.ndarray, forces: np.ndarray) -> np.ndarray:
 
 
 _WEIGHT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+_EYE = np.eye(6)
 
 
 def is_statically_stable(
@@ -451,7 +454,7 @@ def is_statically_stable(
         return False
     r = np.repeat(points - com, cone_edges, axis=0)
     W = _wrenches(r, cone_generators(normals, mu, cone_edges).reshape(n, 3))
-    y, _, flag, _ = daqp.solve(None, -_WEIGHT, W, np.zeros(n), primal_tol=1e-8)
+    y, _, flag, _ = daqp.solve(_EYE, -_WEIGHT, W, np.zeros(n), primal_tol=1e-8)
     return flag == 1 and float(y @ y) <= BALANCE_TOL**2
 
 
@@ -514,10 +517,11 @@ def contact_forces(
         rows = slice(ns + i * cone_edges, ns + (i + 1) * cone_edges)
         A[rows, 3 * i : 3 * i + 3] = facets[i]
     x, _, flag, _ = daqp.solve(H, np.zeros(nf + ns), A, upper, lower, sense)
-    assert flag == 1, f"a feasible, strictly convex QP ended with {flag}"
-    local = x[:nf].reshape(nc, 3)
-    forces = weight * np.einsum("nij,nj->ni", R, local)
-    return ContactForces(forces=forces, residual=float(np.linalg.norm(x[nf:])))
+    local = x[:nf] if flag == 1 else np.zeros(nf)
+    forces = weight * np.einsum("nij,nj->ni", R, local.reshape(nc, 3))
+    reached = A[:ns, :nf] @ local
+    left = reached - np.clip(reached, lower[:ns], upper[:ns])
+    return ContactForces(forces=forces, residual=float(np.linalg.norm(left)))
 
 
 def static_equilibrium(
@@ -536,8 +540,9 @@ def static_equilibrium(
     The horizontal pushes at the centre of mass that the stance can bear, within the
     friction cones and torque limits, are a convex polygon; the margin is the signed
     distance from no push at all to its border. The polygon is explored from inside, one
-    LP (HiGHS) for each direction, until the nearest edge is a true one; about ten LPs,
-    some 15 ms. `is_statically_stable` is the quick test without margin and torques.
+    LP (HiGHS) for each direction, until the nearest edge is a true one: some 8 ms, and
+    35 ms with the torques of 29 joints. `is_statically_stable` is the quick test,
+    without margin and torques.
 
     Args:
         points: (nc, 3) [m].
@@ -562,8 +567,10 @@ def static_equilibrium(
         yields: dict[str, float] = {}
         for name, dual in zip(owners, duals.tolist(), strict=True):
             yields[name] = max(yields.get(name, 0.0), dual)
-        best = max(yields, key=lambda name: yields[name])
-        limiting = best if yields[best] > 1e-9 else None
+        limiting = max(yields, key=lambda name: yields[name])
+        if yields[limiting] <= 1e-9:  # it turns about contacts that stay in place
+            pivot = names[int(np.argmax(np.linalg.norm(held.forces, axis=1)))]
+            limiting = pivot if margin < PUSH_LIMIT - PUSH_TOL else None
     return StaticEquilibrium(
         feasible=margin >= -PUSH_TOL,
         margin=margin,
