@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args, get_type_hints
 
 import pytest
@@ -191,3 +192,134 @@ def test_progress_on_a_terminal_shows_stage_share_and_time_left():
     text = screen.getvalue()
     for word in ("plan", "simulate", "100%", "0:00:00"):
         assert word in text
+
+
+@pytest.fixture
+def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Stand-ins for the stages that note in `calls` what was asked of them."""
+    contact = SimpleNamespace(surface="LHand", support="table")
+    stance = SimpleNamespace(contacts=(contact,), region="O")
+    sequence = SimpleNamespace(stances=(stance,), t=[0.0, 1.5])
+    keyframe = SimpleNamespace(stance=(contact,), com_margin=0.031)
+    skipped = SimpleNamespace(stance=3, reason="out of reach [0.4 m]")
+    plan = SimpleNamespace(
+        keyframes=(keyframe,), skipped=(skipped,), complete=True, trajectory="timed"
+    )
+    criterion = SimpleNamespace(value=0.0123, limit=0.05, ok=True)
+    verdict = SimpleNamespace(reached=True, criteria={"speed [m/s]": criterion})
+    s = SimpleNamespace(calls=[], plan=plan, verdict=verdict, options=None)
+
+    def note(name: str, result: object = None) -> None:
+        def stage(*args: object, **options: object) -> object:
+            s.calls.append(name)
+            if name == "plan":
+                s.options = options["options"]
+            return result
+
+        monkeypatch.setitem(vars(clamber), name, stage)
+
+    for name, result in {
+        "load_demo": "demo",
+        "detect_contacts": sequence,
+        "new_run_folder": tmp_path / "run",
+        "load_sequence": sequence,
+        "load_plan": plan,
+        "plan": plan,
+        "simulate": "rollout",
+        "judge": verdict,
+        "render_run": [tmp_path / "run" / "video.mp4"],
+    }.items():
+        note(name, result)
+    for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
+        note(name)
+    return s
+
+
+def test_climb_saves_each_result_before_the_next_stage_begins(stages: SimpleNamespace):
+    assert cli.main(["climb", "--quiet", "--video", "--method", "lbfgs"]) == 0
+    assert stages.calls == [
+        "load_demo",
+        "detect_contacts",
+        "new_run_folder",
+        "save_sequence",
+        "plan",
+        "save_plan",
+        "simulate",
+        "save_rollout",
+        "judge",
+        "save_verdict",
+        "render_run",
+    ]
+    assert stages.options.method == "lbfgs"
+    assert stages.options.speed == clamber.PlanOptions().speed
+
+
+def test_climb_draws_nothing_unless_asked(stages: SimpleNamespace):
+    assert cli.main(["climb", "--quiet"]) == 0
+    assert "render_run" not in stages.calls
+
+
+@pytest.mark.parametrize("command", [["climb"], ["simulate", "somewhere"]])
+def test_the_exit_code_is_1_if_the_robot_did_not_make_it(
+    command: list[str], stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    stages.verdict.reached = False
+    assert cli.main(command) == 1
+    assert "the robot did not make it" in capsys.readouterr().out
+
+
+def test_a_plan_without_any_move_is_not_simulated(
+    stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    stages.plan.trajectory = None
+    assert cli.main(["climb"]) == 1
+    assert "simulate" not in stages.calls
+    assert "no move of the sequence could be planned" in capsys.readouterr().out
+    assert cli.main(["simulate", "somewhere"]) == 1
+    assert "simulate" not in stages.calls
+
+
+def test_the_table_and_the_json_of_a_climb_agree(
+    stages: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["climb"]) == 0
+    table = capsys.readouterr().out
+    for word in ("speed [m/s]", "0.0123", "0.05", "ok", str(tmp_path / "run")):
+        assert word in table
+    assert "out of reach [0.4 m]" in table
+    assert cli.main(["climb", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["reached"] is True
+    assert record["out"] == str(tmp_path / "run")
+    assert record["criteria"]["speed [m/s]"] == {
+        "value": 0.0123,
+        "limit": 0.05,
+        "ok": True,
+    }
+    assert record["skipped"] == [{"stance": 3, "reason": "out of reach [0.4 m]"}]
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_plan_succeeds_only_if_it_is_complete(
+    complete: bool, stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    stages.plan.complete = complete
+    assert cli.main(["plan", "sequence.json"]) == (0 if complete else 1)
+    assert "LHand on table" in capsys.readouterr().out
+    assert "simulate" not in stages.calls
+
+
+def test_contacts_lists_the_stances_it_found(
+    stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["contacts", "mine.yaml"]) == 0
+    row = capsys.readouterr().out.splitlines()[1].split()
+    assert row == ["0", "O", "0.00", "1.50", "LHand", "on", "table"]
+
+
+def test_render_names_its_files(
+    stages: SimpleNamespace, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["render", "somewhere", "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert files == [str(tmp_path / "run" / "video.mp4")]

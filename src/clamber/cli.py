@@ -194,7 +194,7 @@ class ClimbCommand:
     """The whole job: detect contacts, plan, simulate; all files in one run folder."""
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
-    """A recording, or a built-in demonstration: climb, crossing."""
+    """A recording, or the built-in demonstration (climb)."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     video: bool = False
@@ -212,12 +212,9 @@ class ClimbCommand:
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
             plan = _plan(sequence, robot, scene, self.planning, folder, report)
-            if plan.trajectory is None:
-                verdict = None
-            else:
-                verdict = _simulate(plan, folder, report)
-                if self.video:
-                    _render(folder, report)
+            verdict = _simulate(plan, folder, report)
+            if self.video and verdict is not None:
+                _render(folder, report)
         return _conclude(self.output, folder, plan, verdict)
 
 
@@ -404,8 +401,12 @@ def _plan(
     return result
 
 
-def _simulate(plan: clamber.Plan, folder: Path, report: Report) -> clamber.Verdict:
-    """Simulate, judge and save."""
+def _simulate(
+    plan: clamber.Plan, folder: Path, report: Report
+) -> clamber.Verdict | None:
+    """Simulate, judge and save; None where there is nothing to simulate."""
+    if plan.trajectory is None:
+        return None
     rollout = clamber.simulate(plan, progress=report)
     clamber.save_rollout(rollout, folder)
     verdict = clamber.judge(plan, rollout)
