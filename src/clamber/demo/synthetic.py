@@ -1,0 +1,620 @@
+"""The built-in demonstration: a person climbs a box on hands, elbows and knees.
+
+No recording of this climb is free to ship, so it is made here, says so in its source
+and knows its true contacts. Key poses of pelvis and chest are moved the least that lets
+the limbs reach what they hold on to; between key poses they move with minimum jerk,
+corrected in the same way, so that what is in contact keeps still to the last digit.
+Limbs follow by two-bone inverse kinematics with constant lengths.
+
+World: origin between the ankles, x towards the box, z up. Shapes: T samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from clamber.contact import Contact, ContactInterval
+from clamber.demo.demonstration import (
+    SIDES,
+    Demonstration,
+    build_demonstration,
+)
+from clamber.scene import GROUND, Box, Scene
+from clamber.se3 import frame_from_normal, quat_from_matrix
+
+Tracks = dict[str, np.ndarray]
+
+THIGH, SHANK, UPPER_ARM, FOREARM = 0.373, 0.453, 0.311, 0.254  # [m]
+HIP, SHOULDER = 0.0975, 0.155  # [m] half widths
+TRUNK = 0.527  # [m] from the hips' middle to the shoulders'
+ANKLE, TOE, FOOT = (
+    0.08,
+    0.035,
+    0.15,
+)  # [m] heights standing; ankle to toe along the sole
+KNEE_HEIGHT = ANKLE + SHANK
+# Heights [m] of a joint's centre over what its part rests on.
+WRIST, ELBOW, KNEE = 0.03, 0.05, 0.11
+BOX_LENGTH, BOX_WIDTH = 1.7, 0.9  # [m] across and along the climb, a table
+REACH = 0.985  # of a limb's length: no one locks a loaded joint
+_SIGN = {"L": 1.0, "R": -1.0}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClimbOptions:
+    """What the climb is like.
+
+    Attributes:
+        height_ratio: Box height over knee height; 0.55 to 1.15 look credible.
+        mirrored: The right side goes first.
+        speed: Twice as fast at 2.
+        noise: Standard deviation of a marker's coordinates [m].
+        gaps: How many short stretches of markers are missing.
+        rate: [Hz].
+        near_face: From the ankles to the box [m].
+        hand: Wrist's depth behind the near edge and distance to the side [m].
+        elbow_side: Elbow's distance to the side [m]; its depth follows, since the
+            forearm lies down around the hand, which stays where it is.
+        knee: Knee's depth behind the edge and distance to the side [m].
+    """
+
+    height_ratio: float = 0.94
+    mirrored: bool = False
+    speed: float = 1.0
+    noise: float = 0.002
+    gaps: int = 6
+    rate: float = 120.0
+    near_face: float = 0.42
+    hand: tuple[float, float] = (0.41, 0.06)
+    elbow_side: float = 0.255
+    knee: tuple[float, float] = (0.15, 0.165)
+
+    @property
+    def height(self) -> float:
+        """Of the box [m]."""
+        return self.height_ratio * KNEE_HEIGHT
+
+
+# Names of the key poses, when each is reached [s] and what has just happened.
+_KEYS = (
+    ("stand", 0.0),
+    ("ready", 1.4),
+    ("first hand", 3.2),
+    ("second hand", 5.0),
+    ("first elbow", 7.0),
+    ("second elbow", 9.0),
+    ("first toe-off", 10.5),
+    ("first knee", 12.2),
+    ("second toe-off", 13.9),
+    ("second knee", 15.6),
+    ("settled", 17.6),
+    ("end", 21.5),
+)
+_KEY = {name: i for i, (name, _) in enumerate(_KEYS)}
+
+
+def synthesize_climb(
+    rng: np.random.Generator, *, options: ClimbOptions | None = None
+) -> tuple[Demonstration, list[ContactInterval]]:
+    """Make the climb and say what really was in contact.
+
+    Args:
+        rng: Drives noise, gaps and the body's sway.
+        options: What the climb is like.
+
+    Returns:
+        The recording and its true contacts by start time.
+    """
+    options = options or ClimbOptions()
+    t, tracks, truth = _clean_motion(rng, options)
+    if options.mirrored:
+        tracks, truth = _mirror_tracks(tracks), [_mirror_contact(i) for i in truth]
+    names = tuple(tracks)
+    raw = np.stack([tracks[n] for n in names], axis=1)
+    raw += options.noise * rng.standard_normal(raw.shape)
+    for _ in range(options.gaps):
+        start = int(rng.integers(1, len(t) - 30))
+        length = int(rng.integers(4, 20) * options.rate / 120.0)
+        raw[start : start + length, int(rng.integers(len(names)))] = np.nan
+    demo = build_demonstration(
+        raw,
+        names=names,
+        rate=options.rate,
+        scene=_scene(options),
+        source=f"built-in climb, synthetic (noise {1e3 * options.noise:g} mm)",
+        synthetic=True,
+    )
+    return demo, sorted(truth, key=lambda i: (i.t0, i.part))
+
+
+def _scene(o: ClimbOptions) -> Scene:
+    size = np.array([BOX_WIDTH, BOX_LENGTH, o.height])
+    position = np.array([o.near_face + BOX_WIDTH / 2, 0.0, o.height / 2])
+    box = Box(name="table", size=size, position=position, rotation=np.eye(3))
+    return Scene(boxes=(box,), start=np.zeros(3))
+
+
+# Where parts rest.
+
+
+@dataclass(frozen=True, slots=True)
+class _Holds:
+    """Joint centres (3,) while in contact; `heading` the way a hand points."""
+
+    wrist: dict[str, np.ndarray]
+    elbow: dict[str, np.ndarray]
+    knee: dict[str, np.ndarray]
+    ankle: dict[str, np.ndarray]
+    toe: dict[str, np.ndarray]
+    heading: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def _holds(o: ClimbOptions) -> _Holds:
+    """Contacts of both sides; the elbow lies a forearm's length from the wrist."""
+    h, edge = o.height, o.near_face
+    across = o.elbow_side - o.hand[1]
+    along = np.sqrt(FOREARM**2 - across**2 - (ELBOW - WRIST) ** 2)
+    holds = _Holds({}, {}, {}, {}, {})
+    for s, sign in _SIGN.items():
+        holds.wrist[s] = np.array([edge + o.hand[0], sign * o.hand[1], h + WRIST])
+        holds.elbow[s] = np.array(
+            [edge + o.hand[0] - along, sign * o.elbow_side, h + ELBOW]
+        )
+        holds.knee[s] = np.array([edge + o.knee[0], sign * o.knee[1], h + KNEE])
+        holds.ankle[s] = np.array([0.0, sign * 0.11, ANKLE])
+        holds.toe[s] = holds.ankle[s] + [FOOT, sign * 0.02, TOE - ANKLE]
+        forward = holds.wrist[s] - holds.elbow[s]
+        heading = np.array([forward[0] + 0.1, forward[1] * 0.6, 0.0])
+        holds.heading[s] = heading / np.linalg.norm(heading)
+    return holds
+
+
+# The body: pelvis and chest, (3,) position and (3,) rotation vector each.
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """What keeps the body where it is: points and the limb's length to them.
+
+    `exact` are distances from a hip or shoulder; `within` are upper bounds.
+    """
+
+    exact: tuple[tuple[str, np.ndarray, float], ...] = ()
+    within: tuple[tuple[str, np.ndarray, float], ...] = ()
+
+
+_JOINTS = {
+    "LHip": (0, np.array([0.0, HIP, 0.0])),
+    "RHip": (0, np.array([0.0, -HIP, 0.0])),
+    "LShoulder": (6, np.array([0.0, SHOULDER, 0.0])),
+    "RShoulder": (6, np.array([0.0, -SHOULDER, 0.0])),
+}
+
+
+def _rotate(rotvec: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors (..., 3) turned by rotation vectors (..., 3), Rodrigues' formula."""
+    angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
+    axis = rotvec / np.maximum(angle, 1e-12)
+    v = np.broadcast_to(v, rotvec.shape)
+    along = np.sum(axis * v, axis=-1, keepdims=True) * axis
+    return along + np.cos(angle) * (v - along) + np.sin(angle) * np.cross(axis, v)
+
+
+def _joint(body: np.ndarray, name: str) -> np.ndarray:
+    """(..., 3) position of a hip or shoulder of bodies (..., 12)."""
+    k, offset = _JOINTS[name]
+    return body[..., k : k + 3] + _rotate(body[..., k + 3 : k + 6], offset)
+
+
+def _settle(wanted: np.ndarray, held: _Held, *, trunk: bool) -> np.ndarray:
+    """Bodies (T, 12) nearest to `wanted` that keep what is held.
+
+    Gauss-Newton on the weighted squares of deviation, trunk length (where asked for)
+    and, a thousand times heavier, distances. What satisfies them comes back unchanged.
+    """
+    soft = np.array([3.0] * 3 + [1.0] * 3 + [3.0] * 3 + [1.0] * 3)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        chord = np.linalg.norm(x[:, 6:9] - x[:, 0:3], axis=1)
+        rows = [soft * (x - wanted)]
+        if trunk:
+            bent = np.clip(chord, 0.9 * TRUNK, TRUNK)  # a rounded back is shorter
+            rows.append(8.0 * (chord - bent)[:, None])
+        for name, point, length in held.exact:
+            d = np.linalg.norm(_joint(x, name) - point, axis=1) - length
+            rows.append(1e3 * d[:, None])
+        for name, point, length in held.within:
+            d = np.linalg.norm(_joint(x, name) - point, axis=1) - length
+            rows.append(1e3 * np.maximum(d, 0.0)[:, None])
+        return np.concatenate(rows, axis=1)
+
+    x = wanted.copy()
+    step = 1e-6 * np.eye(12)
+    for _ in range(20):
+        r = residual(x)
+        J = np.stack([(residual(x + e) - r) / 1e-6 for e in step], axis=2)
+        H = J.transpose(0, 2, 1) @ J
+        g = np.einsum("tri,tr->ti", J, r)
+        change = np.linalg.solve(H, g[:, :, None])[:, :, 0]
+        x = x - change
+        if np.abs(change).max() < 1e-10:
+            break
+    return x
+
+
+def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
+    """(K, 12) bodies as one would like them at the key poses.
+
+    Depths are from the ankles, heights relative to the box as far as legs allow.
+    """
+    h, sign = o.height, _SIGN[first]
+    x = o.near_face
+    wrist = x + o.hand[0]
+    tall = ANKLE + SHANK + THIGH
+    hips = min(0.85, h + 0.38)
+    # pelvis x, y, z, pitch; chest x, y, z, pitch, roll towards the first side
+    rows = {
+        "stand": (0.02, 0, tall - 0.004, 0.0, 0.02, 0, tall + TRUNK - 0.01, 0.0, 0),
+        "ready": (0.02, 0, tall - 0.004, 0.0, 0.02, 0, tall + TRUNK - 0.01, 0.0, 0),
+        "first hand": (0.12, 0, hips, 0.7, wrist - 0.24, 0, h + 0.54, 1.1, 0.12),
+        "second hand": (0.14, 0, hips, 0.8, wrist - 0.21, 0, h + 0.50, 1.2, 0),
+        "first elbow": (0.18, 0, hips, 0.9, wrist - 0.12, 0.0, h + 0.38, 1.4, 0.2),
+        "second elbow": (0.21, 0, hips, 1.0, wrist - 0.10, 0, h + 0.32, 1.5, 0),
+        "first toe-off": (0.24, -0.04, hips, 1.0, wrist - 0.07, 0, h + 0.32, 1.5, 0),
+        "first knee": (0.29, -0.02, h + 0.37, 1.0, wrist - 0.04, 0, h + 0.31, 1.5, 0),
+        "second toe-off": (
+            0.31,
+            0.04,
+            h + 0.38,
+            1.0,
+            wrist - 0.03,
+            0,
+            h + 0.30,
+            1.5,
+            0,
+        ),
+        "second knee": (0.33, 0.01, h + 0.39, 1.0, wrist - 0.01, 0, h + 0.29, 1.5, 0),
+        "settled": (0.31, 0, h + 0.375, 1.0, wrist - 0.03, 0, h + 0.30, 1.45, 0),
+        "end": (0.31, 0, h + 0.375, 1.0, wrist - 0.03, 0, h + 0.30, 1.45, 0),
+    }
+    out = np.zeros((len(_KEYS), 12))
+    for name, (px, py, pz, pp, cx, cy, cz, cp, roll) in rows.items():
+        late = x - 0.42 if _KEY[name] >= _KEY["first knee"] else 0.0
+        out[_KEY[name]] = [
+            *(px + late, sign * py, pz, 0.0, pp, 0.0),
+            *(cx, sign * cy, cz, -sign * roll, cp, 0.0),
+        ]
+    return out
+
+
+_FOOT_PITCH = {  # [rad] heels rise: (first side, second side) at the key poses
+    "first elbow": (0.0, 0.0),
+    "second elbow": (0.1, 0.1),
+    "first toe-off": (0.9, 0.15),
+    "first knee": (0.9, 0.75),
+    "second toe-off": (0.9, 1.15),
+}
+
+
+def _ease(tau: np.ndarray) -> np.ndarray:
+    """Minimum-jerk profile from 0 to 1."""
+    tau = np.clip(tau, 0.0, 1.0)
+    return tau**3 * (10.0 - 15.0 * tau + 6.0 * tau**2)
+
+
+def _hit(tau: np.ndarray, slope: float = 1.4) -> np.ndarray:
+    """From rest at 0 to 1 that still moves on arrival: the support stops it."""
+    tau = np.clip(tau, 0.0, 1.0)
+    return (3.0 - slope) * tau**2 + (slope - 2.0) * tau**3
+
+
+def _hop(tau: np.ndarray) -> np.ndarray:
+    """A bump of height 1: off within a few per cent of the time, down with speed."""
+    tau = np.clip(tau, 0.0, 1.0)
+    return 4.0 * tau * (1.0 - tau) * (1.0 - np.exp(-tau / 0.03))
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _blend(a: np.ndarray, b: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Unit vectors (T, 3) on the great circle from a to b."""
+    a, b = np.broadcast_arrays(_unit(a), _unit(b))
+    angle = np.arccos(np.clip(np.sum(a * b, axis=-1, keepdims=True), -1.0, 1.0))
+    w = np.asarray(w)[..., None]
+    wide = np.maximum(np.sin(angle), 1e-9)
+    arc = (np.sin((1 - w) * angle) * a + np.sin(w * angle) * b) / wide
+    return _unit(np.where(angle < 1e-6, a, arc))
+
+
+def _bend(
+    root: np.ndarray, end: np.ndarray, upper: float, lower: float, pole: np.ndarray
+) -> np.ndarray:
+    """Middle joint (T, 3) of a two-bone limb, bent towards `pole`."""
+    line = end - root
+    d = np.linalg.norm(line, axis=-1, keepdims=True)
+    u = line / d
+    along = (d**2 + upper**2 - lower**2) / (2.0 * d)
+    out = np.sqrt(np.maximum(upper**2 - along**2, 0.0))
+    side = _unit(pole - u * np.sum(u * pole, axis=-1, keepdims=True))
+    return root + along * u + out * side
+
+
+def _reach(root: np.ndarray, end: np.ndarray, length: float) -> np.ndarray:
+    """The end (T, 3) drawn in to within a limb's reach."""
+    line = end - root
+    d = np.linalg.norm(line, axis=-1, keepdims=True)
+    return root + line * np.minimum(1.0, length / d)
+
+
+def _toe_pivot(toe: np.ndarray, ankle: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    """Ankle (T, 3) of a foot that has rolled by `pitch` (T,) about its toe."""
+    back = ankle - toe
+    left = np.array([-back[1], back[0], 0.0])
+    left = -left / np.linalg.norm(left)
+    return toe + _rotate(pitch[..., None] * left, back)
+
+
+def _held_from(
+    key: int,
+    o: ClimbOptions,
+    first: str,
+    pitch: Mapping[str, np.ndarray],
+    leaving: bool,
+) -> _Held:
+    """What is held on to from a key pose on.
+
+    Args:
+        key: Index of the key pose.
+        o: What the climb is like.
+        first: The side that goes first.
+        pitch: (T,) of each side's foot.
+        leaving: Whether a foot that lifts off at this pose counts.
+    """
+    holds = _holds(o)
+    exact, within = [], []
+    for s, order in _orders(first):
+        if key >= _KEY[f"{order} elbow"]:
+            exact.append((f"{s}Shoulder", holds.elbow[s], UPPER_ARM))
+        elif key >= _KEY[f"{order} hand"]:
+            reach = REACH * (UPPER_ARM + FOREARM)
+            within.append((f"{s}Shoulder", holds.wrist[s], reach))
+        off = _KEY[f"{order} toe-off"]
+        if key >= _KEY[f"{order} knee"]:
+            exact.append((f"{s}Hip", holds.knee[s], THIGH))
+        elif key < off or (key == off and leaving):
+            ankle = _toe_pivot(holds.toe[s], holds.ankle[s], pitch[s])
+            reach = REACH if key >= _KEY["first hand"] else 0.9995
+            within.append((f"{s}Hip", ankle, reach * (THIGH + SHANK)))
+    return _Held(exact=tuple(exact), within=tuple(within))
+
+
+def _orders(first: str) -> tuple[tuple[str, str], ...]:
+    return (first, "first"), ("R" if first == "L" else "L", "second")
+
+
+def _clean_motion(
+    rng: np.random.Generator, o: ClimbOptions
+) -> tuple[np.ndarray, Tracks, list[ContactInterval]]:
+    """Times (T,), exact tracks (T, 3) and true contacts; the left side goes first."""
+    first = "L"
+    at = np.array([when for _, when in _KEYS]) / o.speed
+    t = np.arange(int(at[-1] * o.rate) + 1) / o.rate
+    phase = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(at) - 2)
+    tau = (t - at[phase]) / np.diff(at)[phase]
+
+    key_pitch = {s: np.zeros(len(at)) for s in SIDES}
+    for name, angles in _FOOT_PITCH.items():
+        for (s, _), angle in zip(_orders(first), angles, strict=True):
+            key_pitch[s][_KEY[name]] = angle
+    pitch = {
+        s: k[phase] + (k[phase + 1] - k[phase]) * _ease(tau)
+        for s, k in key_pitch.items()
+    }
+
+    keys = _wanted(o, first)
+    for k in range(len(at)):
+        now = {s: x[k : k + 1] for s, x in key_pitch.items()}
+        held = _held_from(k, o, first, now, leaving=True)
+        keys[k] = _settle(keys[k : k + 1], held, trunk=True)[0]
+    body = keys[phase] + (keys[phase + 1] - keys[phase]) * _ease(tau)[:, None]
+    body += np.sin(np.pi * tau)[:, None] ** 2 * _sway(rng, t)
+    for k in range(len(at) - 1):
+        m = phase == k
+        now = {s: x[m] for s, x in pitch.items()}
+        held = _held_from(k, o, first, now, leaving=False)
+        body[m] = _settle(body[m], held, trunk=False)
+
+    tracks: Tracks = {"Pelvis": body[:, 0:3]}
+    up = _rotate(body[:, 9:12], np.array([0.0, 0.0, 1.0]))
+    tracks["Neck"] = body[:, 6:9] + 0.05 * up
+    tracks["Head"] = tracks["Neck"] + 0.19 * _unit(up + np.array([0.35, 0.0, 0.25]))
+    clock = _Clock(t=t, at=at)
+    for s, order in _orders(first):
+        tracks |= _arm(s, order, clock, body, keys, _holds(o))
+        tracks |= _leg(s, order, clock, body, keys, pitch[s], key_pitch[s], _holds(o))
+    return t, tracks, _true_contacts(o, first, at, float(t[-1]))
+
+
+def _sway(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
+    """(T, 12) slow unrest of a few millimetres: nobody stands like a statue."""
+    out = np.zeros((len(t), 12))
+    for column in (0, 1, 2, 6, 7, 8):
+        for frequency in rng.uniform(0.2, 0.6, size=2):
+            phase = rng.uniform(0.0, 2.0 * np.pi)
+            out[:, column] += 0.002 * np.sin(2.0 * np.pi * frequency * t + phase)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    """Sample times and key times, asked for by the keys' names."""
+
+    t: np.ndarray
+    at: np.ndarray
+
+    def since(self, name: str) -> np.ndarray:
+        """(T,) whether the key pose is past."""
+        return self.t >= self.at[_KEY[name]] - 1e-9
+
+    def part(self, start: str, end: str) -> np.ndarray:
+        """(T,) share of the time from one key pose to another that is past."""
+        a, b = self.at[_KEY[start]], self.at[_KEY[end]]
+        return np.clip((self.t - a) / (b - a), 0.0, 1.0)
+
+
+def _arm(
+    s: str, order: str, clock: _Clock, body: np.ndarray, keys: np.ndarray, holds: _Holds
+) -> Tracks:
+    """Shoulder, elbow and hand: hang, reach for the box, lie down around the wrist."""
+    sign = _SIGN[s]
+    shoulder = _joint(body, f"{s}Shoulder")
+    hand, elbow = f"{order} hand", f"{order} elbow"
+    hold = holds.wrist[s]
+    hang = np.array([0.05, sign * 0.05, -0.54])
+    wrist = shoulder + hang
+    lift = _joint(keys[_KEY["ready"]], f"{s}Shoulder") + hang
+    if order == "first":
+        goes = clock.part("ready", hand)
+    else:  # wait over the box until the other hand has arrived
+        goes = clock.part("first hand", hand)
+        wait = hold + np.array([-0.12, sign * 0.08, 0.20])
+        ready = clock.part("ready", "first hand")
+        path = lift + (wait - lift) * _ease(ready)[:, None]
+        path[:, 2] += 0.10 * np.sin(np.pi * _ease(ready))
+        wrist = np.where(clock.since("ready")[:, None], path, wrist)
+        lift = wait
+    path = lift + (hold - lift) * _hit(goes)[:, None]
+    path[:, 2] += 0.13 * _hop(goes)
+    wrist = np.where((goes > 0)[:, None], path, wrist)
+    wrist = _reach(shoulder, wrist, 0.995 * (UPPER_ARM + FOREARM))
+    wrist[clock.since(hand)] = hold
+
+    propped = np.array([-0.5, sign * 1.0, 0.1])
+    middle = (_joint(keys[_KEY[elbow]], f"{s}Shoulder") + hold) / 2
+    pole = _blend(
+        np.array([-1.0, sign * 0.3, 0.0]), propped, _ease(clock.part("ready", hand))
+    )
+    down = _hit(clock.part(hand if order == "second" else "second hand", elbow))
+    pole = _blend(pole, holds.elbow[s] - middle, down)
+    joint = _bend(shoulder, wrist, UPPER_ARM, FOREARM, pole)
+    joint[clock.since(elbow)] = holds.elbow[s]
+
+    flat = _unit(holds.heading[s] - [0.0, 0.0, (WRIST - 0.02) / 0.084])
+    along = _blend(_unit(wrist - joint), flat, _ease(1.2 * clock.part("ready", hand)))
+    return {
+        f"{s}Shoulder": shoulder,
+        f"{s}Elbow": joint,
+        f"{s}Hand": wrist,
+        f"{s}Hand.knuckle": wrist + 0.084 * along,
+        f"{s}Hand.tip": wrist + 0.157 * along,
+    }
+
+
+def _leg(
+    s: str,
+    order: str,
+    clock: _Clock,
+    body: np.ndarray,
+    keys: np.ndarray,
+    pitch: np.ndarray,
+    key_pitch: np.ndarray,
+    holds: _Holds,
+) -> Tracks:
+    """Hip, knee and foot: stand, roll onto the toes, swing the knee onto the box."""
+    off, on = f"{order} toe-off", f"{order} knee"
+    hip = _joint(body, f"{s}Hip")
+    pole = np.array([1.0, 0.15 * _SIGN[s], 0.2])
+
+    def stand(
+        hips: np.ndarray, angle: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        ankle = _toe_pivot(holds.toe[s], holds.ankle[s], angle)
+        knee = _bend(hips, ankle, THIGH, SHANK, pole)
+        return knee, ankle, np.broadcast_to(holds.toe[s], ankle.shape)
+
+    knee, ankle, toe = stand(hip, pitch)
+    left = _joint(keys[_KEY[off]][None], f"{s}Hip")
+    knee0, ankle0, toe0 = stand(left, key_pitch[[_KEY[off]]])
+
+    goes = clock.part(off, on)
+    path = knee0 + (holds.knee[s] - knee0) * _hit(goes)[:, None]
+    path[:, 2] += 0.14 * _hop(goes)
+    swing = hip + THIGH * _unit(path - hip)
+    swing[clock.since(on)] = holds.knee[s]
+    lying = np.array([-1.0, 0.0, -0.12])
+    swing_ankle = swing + SHANK * _blend(ankle0 - knee0, lying, _ease(goes))
+    length = np.linalg.norm(holds.toe[s] - holds.ankle[s])
+    hanging = np.array([-0.45, 0.0, -0.9])
+    swing_toe = swing_ankle + length * _blend(toe0 - ankle0, hanging, _ease(goes))
+    past = clock.since(off)[:, None]
+    return {
+        f"{s}Hip": hip,
+        f"{s}Knee": np.where(past, swing, knee),
+        f"{s}Foot": np.where(past, swing_ankle, ankle),
+        f"{s}Foot.toe": np.where(past, swing_toe, toe),
+    }
+
+
+def _true_contacts(
+    o: ClimbOptions, first: str, at: np.ndarray, end: float
+) -> list[ContactInterval]:
+    """What is in contact by construction."""
+    holds, out = _holds(o), []
+    up = np.array([0.0, 0.0, 1.0])
+    for s, order in _orders(first):
+        knee, forearm = np.array([1.0, 0.0, 0.0]), holds.wrist[s] - holds.elbow[s]
+        when = {
+            k: float(at[_KEY[f"{order} {k}"]])
+            for k in ("hand", "elbow", "toe-off", "knee")
+        }
+        rows = (
+            (
+                "Foot",
+                GROUND,
+                0.0,
+                when["toe-off"],
+                holds.ankle[s],
+                holds.toe[s] - holds.ankle[s],
+            ),
+            ("Hand", "table", when["hand"], end, holds.wrist[s], holds.heading[s]),
+            ("Elbow", "table", when["elbow"], end, holds.elbow[s], forearm),
+            ("Knee", "table", when["knee"], end, holds.knee[s], knee),
+        )
+        for part, support, t0, t1, p, heading in rows:
+            contact = Contact(
+                surface=s + part,
+                support=support,
+                position=np.array([p[0], p[1], 0.0 if support == GROUND else o.height]),
+                quaternion=quat_from_matrix(frame_from_normal(up, heading)),
+            )
+            out.append(
+                ContactInterval(
+                    part=s + part, is_surface=True, t0=t0, t1=t1, contact=contact
+                )
+            )
+    return out
+
+
+def _swap(name: str) -> str:
+    return {"L": "R", "R": "L"}[name[0]] + name[1:] if name[0] in "LR" else name
+
+
+def _mirror_tracks(tracks: Tracks) -> Tracks:
+    """The same motion in a mirror that keeps the x-z plane."""
+    return {_swap(n): x * [1.0, -1.0, 1.0] for n, x in tracks.items()}
+
+
+def _mirror_contact(i: ContactInterval) -> ContactInterval:
+    w, x, y, z = i.contact.quaternion
+    contact = replace(
+        i.contact,
+        surface=_swap(i.part),
+        position=i.contact.position * [1.0, -1.0, 1.0],
+        quaternion=np.array([w, -x, y, -z]),
+    )
+    return replace(i, part=_swap(i.part), contact=contact)
