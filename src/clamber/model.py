@@ -308,8 +308,10 @@ def build_world(robot: Robot, scene: Scene) -> World:
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.quality.shadowsize = 4096
     _add_scene(spec, scene)
-    model = spec.compile()
+    spec.compile()
     xml = spec.to_xml()
+    # Written numbers are rounded: plan with what a reader of the file will simulate.
+    model = mujoco.MjSpec.from_string(xml).compile()
     return _index(model, xml, robot, scene)
 
 
@@ -716,10 +718,10 @@ class Kinematics:
         p = np.array(points).reshape(-1, 2, 3)
         distance = np.array(dist)
         delta = p[:, 1] - p[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            normal = delta / distance[:, None]
-        bad = ~np.isfinite(normal).all(axis=1)
-        normal[bad] = 0.0
+        touching = np.abs(distance) < 1e-9
+        normal = delta / np.where(touching, 1.0, distance)[:, None]
+        for i in np.flatnonzero(touching):
+            normal[i] = self._touching_normal(keep[i])
         return Proximity(
             pairs=np.array(keep, dtype=int),
             distance=distance,
@@ -727,6 +729,17 @@ class Kinematics:
             first=p[:, 0],
             second=p[:, 1],
         )
+
+    def _touching_normal(self, pair: int) -> np.ndarray:
+        """(3,) from the first geom to the second where their distance is zero."""
+        a, b = self._first[pair], self._second[pair]
+        x, R = self.data.geom_xpos, self.data.geom_xmat
+        if self._plane[pair]:
+            return R[a].reshape(3, 3)[:, 2]
+        if self._plane2[pair]:
+            return -R[b].reshape(3, 3)[:, 2]
+        n = x[b] - x[a]
+        return n / np.linalg.norm(n)
 
     def integrate(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """(nq,) `q` moved along the tangent vector `v` (nv,) for unit time."""

@@ -28,10 +28,18 @@ from clamber.retarget import retarget
 from clamber.scene import GROUND, Scene
 from clamber.se3 import quat_from_matrix
 from clamber.trajectory import Trajectory, build_trajectory
-from clamber.transition import Move, Transition, approach_contact, plan_transition
+from clamber.transition import (
+    Move,
+    Transition,
+    approach_contact,
+    eased_contact,
+    plan_transition,
+)
 
 Method = Literal["direct", "lbfgs", "gradient"]
 METHODS = {"direct": direct.optimise, "lbfgs": lbfgs.optimise, "gradient": gradient.optimise}
+MOVED = 0.005  # [m] a repair by less is none
+MAX_REPAIRS = 4  # earlier contacts that may be put elsewhere for a later move's sake
 SAME_PLACE = 0.03  # [m] a contact made again nearer than this has not moved
 Progress = Callable[[str, float, str], None]
 
@@ -112,20 +120,37 @@ def plan(
     keyframes = [standing(ik, options)]
     paths: list[Path] = []
     skipped: list[Skipped] = []
-    missed = ""
     moves = list(moves_of(goal, world))
-    for k, (index, stance, move) in enumerate(moves):
-        report("plan", k / len(moves), str(move) if isinstance(move, Move) else move)
+    for index, _, move in moves:
         if not isinstance(move, Move):
             skipped.append(Skipped(stance=index, reason=move))
-            continue
+    moves = [m for m in moves if isinstance(m[2], Move)]
+    done: list[int] = []  # the move that each path makes
+    missed: list[Skipped] = []
+    repairs = k = 0
+    while k < len(moves):
+        index, stance, move = moves[k]
+        report("plan", k / len(moves), str(move))
         result = plan_move(ik, keyframes[-1], move, stance, options, clock)
-        if isinstance(result, str):
-            skipped.append(Skipped(stance=index, reason=result))
-            missed = result
+        if not isinstance(result, str):
+            keyframes.append(result[0])
+            paths.append(result[1])
+            done.append(k)
+            k += 1
             continue
-        keyframes.append(result[0])
-        paths.append(result[1])
+        better = repair(ik, keyframes, paths, move) if repairs < MAX_REPAIRS else None
+        clock.lap("repairs")
+        if better is None:
+            missed.append(Skipped(stance=index, reason=result))
+            k += 1
+            continue
+        repairs += 1
+        j, contact = better
+        k = done[j]
+        del keyframes[j + 1 :], paths[j:], done[j:]
+        missed = [m for m in missed if m.stance <= moves[k][0]]
+        moves[k] = (*moves[k][:2], replace(moves[k][2], makes=contact, firm=True))
+    skipped += missed
     trajectory = None
     if paths:
         report("trajectory", 1.0, "")
@@ -146,6 +171,28 @@ def plan(
         complete=not missed and bool(paths),
         timings=clock.laps,
     )
+
+
+def repair(
+    ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
+) -> tuple[int, Contact] | None:
+    """Which earlier path should have made its contact elsewhere for `move` to work.
+
+    Looks at the last contact first.
+
+    Returns:
+        Index of the path, and the contact at its better place; None where none helps.
+    """
+    standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
+    for j in range(len(paths) - 1, -1, -1):
+        made = paths[j].transition.move.makes
+        if made is None or made.surface not in standing_on:
+            continue
+        standing_on.discard(made.surface)
+        contact = eased_contact(ik, keyframes[-1], move, made.surface)
+        if contact is not None and np.linalg.norm(contact.position - made.position) > MOVED:
+            return j, contact
+    return None
 
 
 class _Clock:
@@ -283,7 +330,10 @@ def plan_move(
         q_reference=before.q,
         directions=stance.posture,
     )
-    key = METHODS[options.method](ik, task, before.q, options.keyframe)
+    if move.firm and move.makes:
+        key = _keyframe_there(ik, task, move.makes, before.q, options)
+    else:
+        key = METHODS[options.method](ik, task, before.q, options.keyframe)
     clock.lap("keyframes")
     transition = plan_transition(ik, before, key, move)
     clock.lap("transitions")
@@ -313,12 +363,15 @@ def _again_from_reach(
     """Put the contact where the unloaded robot reaches it, and optimise around that."""
     assert move.makes is not None
     wanted = next(c for c in key.stance if c.surface == move.makes.surface)
-    contact, solution = approach_contact(ik, task.held, wanted, transition.shifted)
-    again = METHODS[options.method](
-        ik,
-        replace(task, held=(*task.held, contact), new=()),
-        solution.q,
-        options.keyframe,
-    )
+    again = _keyframe_there(ik, task, wanted, transition.shifted, options)
     again = replace(again, cost_before=key.cost_before, iterations=key.iterations + again.iterations)
     return again, plan_transition(ik, before, again, move)
+
+
+def _keyframe_there(
+    ik: IK, task: KeyframeTask, wanted: Contact, q: np.ndarray, options: PlanOptions
+) -> Keyframe:
+    """A stable posture with the new contact at, or nearest to, a given place."""
+    contact, solution = approach_contact(ik, task.held, wanted, q)
+    fixed = replace(task, held=(*task.held, contact), new=())
+    return METHODS[options.method](ik, fixed, solution.q, options.keyframe)

@@ -44,11 +44,13 @@ class Move:
         limb: Its name.
         breaks: Surfaces that leave their contacts.
         makes: The contact that is made, its position a reference until optimised.
+        firm: The position is taken as it is, or as near as can be reached.
     """
 
     limb: str
     breaks: tuple[str, ...]
     makes: Contact | None
+    firm: bool = False
 
     def __str__(self) -> str:
         """Such as `LHand -> LElbow on box`."""
@@ -210,6 +212,45 @@ def _touch(
     )
     problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
     return ik.solve(problem, after)
+
+
+def eased_contact(ik: IK, before: Keyframe, move: Move, surface: str) -> Contact | None:
+    """Where an earlier contact should have been for a move's weight shift to work.
+
+    Solves the shift with that contact free on its support.
+
+    Returns:
+        The contact at its better place; None where that does not help either.
+    """
+    world = ik.world
+    held = tuple(c for c in before.stance if c.surface not in (*move.breaks, surface))
+    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    moved = next(c for c in before.stance if c.surface == surface)
+    middle = np.mean([c.position for c in (*held, moved)], axis=0)
+    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
+    goal = ContactGoal(
+        surface=surface,
+        support=moved.support,
+        position=moved.position,
+        rotation=support_rotation(world.supports[moved.support], moved.quaternion),
+        free=True,
+        reference=1.0,
+    )
+    problem = balance_problem(
+        world,
+        held=held,
+        closed=rolling,
+        q_reference=before.q,
+        extra=(goal,),
+        touching={surface: moved.support},
+    )
+    solution = ik.solve(problem, before.q)
+    if solution.status is not Status.SOLVED:
+        return None
+    ik.kin.update(solution.q)
+    support = world.supports[moved.support]
+    p = ik.kin.contact_point(surface, support.normal)
+    return replace(moved, position=p - support.normal * support.height(p))
 
 
 def approach_contact(

@@ -36,6 +36,8 @@ CONTACT_STEP = 0.05  # [m, rad] largest contact error asked for in one iteration
 DISTANCE_STEP = 0.03  # [m] deepest recovery from a collision in one iteration
 ACTIVE_RANGE = 0.10  # [m] farther pairs have no row
 DAMPING = 2e-4  # mu
+MIN_RADIUS = 1e-3  # of the trust region, where the solve has stalled
+PENALTY = 300.0  # of violations against the soft cost, in the merit of a step
 CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
@@ -232,7 +234,10 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class QP:
-    """min 1/2 x'Hx + c'x with bounds on x first, then rows `lo <= A x <= hi`."""
+    """min 1/2 x'Hx + c'x with bounds on x first, then rows `lo <= A x <= hi`.
+
+    `merit` is the exact-penalty cost of the configuration it was built at.
+    """
 
     H: np.ndarray
     c: np.ndarray
@@ -240,6 +245,7 @@ class QP:
     lo: np.ndarray
     hi: np.ndarray
     sense: np.ndarray
+    merit: float
 
 
 class IK:
@@ -261,21 +267,17 @@ class IK:
         self._limited = np.flatnonzero(joints)
         self._q_of_dof = np.full(nv, -1)
         self._q_of_dof[world.dadr] = world.qadr
+        self._violation = 0.0
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._geom_body = world.model.geom_bodyid
 
-    def build(self, problem: PostureProblem, q: np.ndarray, radius: float = 1.0) -> QP:
-        """The QP at `q`; `Kinematics` of this workspace is left at `q`.
-
-        Args:
-            problem: What is wanted.
-            q: (nq,).
-            radius: Share of the largest step that this step may take.
-        """
+    def build(self, problem: PostureProblem, q: np.ndarray) -> QP:
+        """The QP at `q`; `Kinematics` of this workspace is left at `q`."""
         kin, w = self.kin, self.world
         kin.update(q)
         soft, hard, ineq = self._soft, self._hard, self._ineq
         soft.n = hard.n = ineq.n = 0
+        self._violation = 0.0
         for goal in problem.goals:
             self._goal_rows(goal)
         self._direction_rows(problem)
@@ -291,15 +293,17 @@ class IK:
         J, e = soft.J[: soft.n], soft.lo[: soft.n]
         H = J.T @ J
         c = J.T @ e
+        cost = 0.5 * float(e @ e)
         diagonal = np.full(nv, DAMPING)
         if problem.posture_weight > 0:
             d = kin.difference(problem.q_reference, q)
             weight = problem.posture_weight**2
             c[w.dadr] += weight * d[w.dadr]
+            cost += 0.5 * weight * float(d[w.dadr] @ d[w.dadr])
             diagonal[w.dadr] += weight
         H[np.diag_indices(nv)] += diagonal
 
-        lo, hi = -radius * self._step, radius * self._step
+        lo, hi = -self._step, self._step.copy()
         k = self._limited
         now = q[self._q_of_dof[k]]
         lo[k] = np.maximum(lo[k], w.q_min[k] - now)
@@ -314,14 +318,25 @@ class IK:
             sense=np.concatenate(
                 [np.zeros(nv, np.int32), np.full(hard.n, EQUALITY, np.int32), np.full(ineq.n, SOFT, np.int32)]
             ),
+            merit=cost + PENALTY * self._violation,
         )
 
-    def step(self, qp: QP) -> np.ndarray:
-        """Solve; contacts that contradict one another become soft, heavily weighted."""
-        x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, qp.hi, qp.lo, qp.sense)
+    def step(self, qp: QP, radius: float = 1.0) -> np.ndarray:
+        """Solve; contacts that contradict one another become soft, heavily weighted.
+
+        Args:
+            qp: From `build`.
+            radius: Share of the largest step that this one may take.
+        """
+        nv = len(qp.c)
+        lo, hi = qp.lo, qp.hi
+        if radius < 1.0:
+            lo, hi = lo.copy(), hi.copy()
+            lo[:nv] = np.maximum(lo[:nv], -radius * self._step)
+            hi[:nv] = np.minimum(hi[:nv], radius * self._step)
+        x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, hi, lo, qp.sense)
         if flag > 0:
             return x
-        nv = len(qp.c)
         m = int(np.count_nonzero(qp.sense == EQUALITY))
         J, e = qp.A[:m], -qp.lo[nv : nv + m]
         keep = np.r_[0:nv, nv + m : len(qp.lo)]
@@ -329,8 +344,8 @@ class IK:
             qp.H + 1e4 * J.T @ J,
             qp.c + 1e4 * J.T @ e,
             qp.A[m:],
-            qp.hi[keep],
-            qp.lo[keep],
+            hi[keep],
+            lo[keep],
             qp.sense[keep],
         )
         return x if flag > 0 else np.zeros(nv)
@@ -345,20 +360,25 @@ class IK:
     ) -> Solution:
         """Iterate from `q` until the step is below `tolerance`.
 
-        A step that turns back on the one before has overshot: the next may go only half
-        as far; otherwise the reach grows again.
+        A trust region on an exact penalty: a step that raises the merit is taken back
+        and tried again a quarter as long. The first step is always taken: a new contact
+        must be allowed to start.
         """
         n, converged, radius = 0, False, 1.0
-        last = np.zeros(self.world.model.nv)
+        qp = self.build(problem, q)
         for n in range(1, iterations + 1):
-            dq = self.step(self.build(problem, q, radius))
-            q = self.kin.integrate(q, dq)
-            if np.abs(dq).max() < tolerance:
-                converged = True
+            dq = self.step(qp, radius)
+            size = float(np.abs(dq).max())
+            trial = self.kin.integrate(q, dq)
+            new = self.build(problem, trial)
+            if n == 1 or new.merit <= qp.merit:
+                q, qp = trial, new
+                converged = size < tolerance and size < 0.9 * radius * STEP_ROTATION
+                radius = min(2.0 * radius, 1.0)
+            else:
+                radius *= 0.25
+            if converged or radius < MIN_RADIUS:
                 break
-            turned = float(dq @ last) < -0.25 * float(np.linalg.norm(dq) * np.linalg.norm(last))
-            radius = max(0.5 * radius, 0.02) if turned else min(1.5 * radius, 1.0)
-            last = dq
         return Solution(
             q=q, iterations=n, residuals=self.residuals(problem, q), converged=converged
         )
@@ -425,6 +445,7 @@ class IK:
             turn = kin.flat_error(g.surface, g.rotation)
             axis = self._edge_axis(g)
             across = np.stack([n, np.cross(n, axis)])
+            self._violation += _size(g.position - p) + _size(across @ turn)
             k = self._hard.take(5)
             self._hard.J[k.start : k.start + 3] = jac
             self._hard.lo[k.start : k.start + 3] = _clip(g.position - p)
@@ -434,20 +455,25 @@ class IK:
             return
         if not g.free:
             m = 6 if s.is_flat else 3
+            self._violation += _size(g.position - p)
             k = self._hard.take(m)
             self._hard.J[k.start : k.start + 3] = jac
             self._hard.lo[k.start : k.start + 3] = _clip(g.position - p)
             if s.is_flat:
+                turn = kin.flat_error(g.surface, g.rotation)
+                self._violation += _size(turn)
                 self._hard.J[k.start + 3 : k.stop] = rot
-                self._hard.lo[k.start + 3 : k.stop] = _clip(kin.flat_error(g.surface, g.rotation))
+                self._hard.lo[k.start + 3 : k.stop] = _clip(turn)
             return
         k = self._hard.take(3 if s.is_flat else 1)
+        self._violation += abs(float(support.height(p)))
         self._hard.J[k.start] = n @ jac
         self._hard.lo[k.start] = np.clip(-support.height(p), -CONTACT_STEP, CONTACT_STEP)
         A, b = self._edges[g.support]
         if s.is_flat:
             turn = kin.flat_error(g.surface, g.rotation)
             R = support.rotation
+            self._violation += _size(R[:, :2].T @ turn)
             self._hard.J[k.start + 1 : k.stop] = R[:, :2].T @ rot
             self._hard.lo[k.start + 1 : k.stop] = _clip(R[:, :2].T @ turn)
             self._target(n[None] @ rot, -(n @ turn)[None], 0.3)
@@ -477,6 +503,7 @@ class IK:
         near = room < 0.15
         if not near.any():
             return
+        self._violation += float(np.maximum(-room[near], 0.0).sum())
         k = self._ineq.take(int(near.sum()))
         self._ineq.J[k] = A[near] @ jac
         self._ineq.hi[k] = np.maximum(room[near], -CONTACT_STEP)
@@ -530,9 +557,11 @@ class IK:
         com = self.kin.com[:2].copy()
         J = self.kin.com_jacobian()[:2]
         A, b = polygon_halfplanes(polygon)
+        room = b - problem.balance_margin - A @ com
+        self._violation += max(float(-room.min()), 0.0)
         k = self._ineq.take(len(b))
         self._ineq.J[k] = A @ J
-        self._ineq.hi[k] = np.maximum(b - problem.balance_margin - A @ com, -CONTACT_STEP)
+        self._ineq.hi[k] = np.maximum(room, -CONTACT_STEP)
         self._ineq.lo[k] = -1e30
         if problem.com_weight > 0:
             self._target(J, com - polygon.mean(axis=0), problem.com_weight)
@@ -569,8 +598,15 @@ class IK:
                 self._ineq.J[row] = n @ kin.point_jacobian(int(b), p2)
             else:
                 self._ineq.J[row] = -n @ kin.point_jacobian(int(a), p1)
-        self._ineq.lo[k] = np.minimum(clearance[near.pairs] - near.distance, DISTANCE_STEP)
+        short = clearance[near.pairs] - near.distance
+        self._violation += float(np.maximum(short, 0.0).sum())
+        self._ineq.lo[k] = np.minimum(short, DISTANCE_STEP)
         self._ineq.hi[k] = 1e30
+
+
+def _size(e: np.ndarray) -> float:
+    """Euclidean length."""
+    return float(np.sqrt(e @ e))
 
 
 def _clip(e: np.ndarray) -> np.ndarray:
