@@ -265,6 +265,22 @@ def test_the_ellipse_of_a_triangle_touches_the_middles_of_its_sides():
         assert ellipse.excess(middle)[0] == pytest.approx(0.0, abs=1e-12)
 
 
+def test_the_ellipse_has_the_axes_of_the_second_moments_of_area():
+    rng = np.random.default_rng(19)
+    polygon = support_polygon(rng.normal(size=(7, 2)) * [1.0, 0.4])
+    A, b = polygon_halfplanes(polygon)
+    low, high = polygon.min(axis=0), polygon.max(axis=0)
+    samples = low + (high - low) * rng.random((400_000, 2))
+    samples = samples[np.all(samples @ A.T < b, axis=1)]
+    ellipse = support_ellipse(polygon)
+    np.testing.assert_allclose(ellipse.centre, samples.mean(axis=0), atol=5e-3)
+    values, vectors = np.linalg.eigh(np.cov(samples.T))
+    ratio = math.sqrt(values[1] / values[0])
+    assert ellipse.semi_axes[0] / ellipse.semi_axes[1] == pytest.approx(ratio, rel=5e-3)
+    along = ellipse.foci[1] - ellipse.foci[0]
+    assert abs(along @ vectors[:, 1]) == pytest.approx(np.linalg.norm(along), rel=1e-3)
+
+
 def test_the_gradient_of_the_excess_matches_finite_differences():
     rng = np.random.default_rng(7)
     ellipse = support_ellipse(support_polygon(rng.normal(size=(9, 2))))
@@ -391,6 +407,20 @@ def test_the_margin_on_level_ground_is_the_push_that_tips_or_slides():
     assert margin(0.06, 0.8) == pytest.approx(0.04 / 0.8, abs=1e-5)
     assert margin(0.14, 0.8) == pytest.approx(-0.04 / 0.8, abs=1e-5)
     assert margin(0.0, 0.1) == pytest.approx(0.5 / math.sqrt(2), abs=1e-5)
+
+
+def test_the_margin_on_level_ground_is_that_of_the_centre_of_mass_over_its_height():
+    """Outside too, where the nearest push that helps may be towards a corner."""
+    rng = np.random.default_rng(20)
+    outside = 0
+    for _ in range(40):
+        xy = rng.uniform(-0.1, 0.1, (7, 2))
+        com = np.append(rng.uniform(-0.12, 0.12, 2), 0.8)
+        expected = com_margin(com, support_polygon(xy)) / 0.8
+        outside += expected < 0
+        verdict = static_equilibrium(*flat(xy, 0.9), com, MASS, names=["foot"] * 7)
+        assert verdict.margin == pytest.approx(expected, abs=2e-6)
+    assert 10 < outside < 35
 
 
 def test_eight_edges_come_closer_to_the_cone_than_four():
@@ -564,7 +594,8 @@ def test_contact_forces_balance_gravity_within_the_cones():
 def test_contact_forces_are_the_least_of_those_that_balance():
     """Against the weighted pseudo-inverse, where no cone binds."""
     points, normals, mu = flat(np.r_[SQUARE, [[0.3, 0.0]]], 0.8)
-    com = np.array([0.04, 0.02, 0.5])
+    points = points + np.outer([0, 0, 0, 0, 1], [0.0, 0.0, 0.3])  # a hand on a table
+    com = np.array([0.06, 0.02, 0.5])
     G = np.concatenate(
         [
             np.tile(np.eye(3), (1, 5)),
@@ -607,8 +638,11 @@ def test_the_best_effort_leaves_no_more_unbalanced_than_it_must():
 A_LEG, H_LEG = 0.2, 0.5
 
 
-def a_frame(limit: float) -> tuple[np.ndarray, TorqueLimits]:
-    """Feet and torque limits; dofs: base x y z, base rotation, left, right hip."""
+def a_frame(limit: float, *, leg_mass: float = 0.0) -> tuple[np.ndarray, TorqueLimits]:
+    """Feet and torque limits; dofs: base x y z, base rotation, left, right hip.
+
+    The mass of each leg sits in its foot, so that feet cost the hips less torque.
+    """
     feet = np.array([[A_LEG, 0.0, -H_LEG], [-A_LEG, 0.0, -H_LEG]])
     J = np.zeros((6, 8))
     for i, p in enumerate(feet):
@@ -616,7 +650,9 @@ def a_frame(limit: float) -> tuple[np.ndarray, TorqueLimits]:
         J[rows, :3] = np.eye(3)
         J[rows, 3:6] = np.cross(np.eye(3), p).T  # v = omega x p
         J[rows, 6 + i] = np.cross([0.0, 1.0, 0.0], p)
+    leg = np.array([0.0, 0.0, leg_mass * GRAVITY])
     gravity = np.array([0.0, 0.0, WEIGHT, 0.0, 0.0, 0.0, 0.0, 0.0])
+    gravity[6:] = J[:3, 6] @ leg, J[3:, 7] @ leg
     return feet, TorqueLimits(
         jacobian=J,
         gravity=gravity,
@@ -635,11 +671,15 @@ def test_hip_torques_of_an_a_frame_are_those_computed_by_hand():
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.2, 0.3])
-def test_an_a_frame_holds_iff_its_hips_bear_what_friction_leaves(mu):
-    """Feet pressed apart with mu m g / 2 relieve the hips to (a - mu h) m g / 2."""
-    needed = (A_LEG - mu * H_LEG) * WEIGHT / 2
+@pytest.mark.parametrize("leg_mass", [0.0, 2.0])
+def test_an_a_frame_holds_iff_its_hips_bear_what_friction_leaves(mu, leg_mass):
+    """Feet held together by mu m g / 2 relieve the hips to (a - mu h) m g / 2.
+
+    Of a leg's own weight, which rests on the ground, the hip feels nothing.
+    """
+    needed = (A_LEG - mu * H_LEG) * WEIGHT / 2 - A_LEG * leg_mass * GRAVITY
     for factor, holds in ((1.001, True), (0.999, False)):
-        feet, torque = a_frame(needed * factor)
+        feet, torque = a_frame(needed * factor, leg_mass=leg_mass)
         normals, friction = np.tile(UP, (2, 1)), np.full(2, mu)
         com = np.zeros(3)
         assert is_statically_stable(feet, normals, friction, com)
