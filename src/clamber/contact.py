@@ -40,6 +40,9 @@ class Contact:
         quaternion: (4,) orientation of C in the world, wxyz.
         edge: A flat surface rolled onto one of its four edges: the edge's index, and
             `position` is the middle of that edge. None while it lies flat.
+        link: (4,) orientation of a round surface's link in the world where it touches at
+            `position`; as the link turns, the surface rolls from there. None where the
+            contact is not a robot's posture yet.
     """
 
     surface: str
@@ -47,6 +50,7 @@ class Contact:
     position: np.ndarray
     quaternion: np.ndarray
     edge: int | None = None
+    link: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""
@@ -56,6 +60,10 @@ class Contact:
                 raise ValueError(f"{name} {x}, expected {n} finite numbers")
             x.setflags(write=False)
             object.__setattr__(self, name, x)
+        if self.link is not None:
+            link = np.array(self.link, dtype=float)
+            link.setflags(write=False)
+            object.__setattr__(self, "link", link)
 
 
 def region_of(contacts: tuple[Contact, ...]) -> Region:

@@ -674,6 +674,22 @@ class Kinematics:
         s = self.world.surface(surface, edge)
         return self.point(s.body, s.corners) - s.radius * normal
 
+    def roll(self, surface: str, normal: np.ndarray, link: np.ndarray | None) -> np.ndarray:
+        """(3,) how far a round surface's contact has rolled from where its link was.
+
+        For a turn theta of the link, r theta x n: exact about one axis.
+
+        Args:
+            surface: Its name.
+            normal: (3,) of the support.
+            link: (4,) orientation of the link where the contact was taken, or None.
+        """
+        s = self.world.surfaces[surface]
+        if link is None or s.radius == 0.0:
+            return np.zeros(3)
+        turn = rotation_vector(self.rotation(s.body) @ matrix_from_quat(link).T)
+        return s.radius * np.cross(turn, normal)
+
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
         """(3,) world rotation vector from the surface's frame to the contact frame."""
         s = self.world.surfaces[surface]

@@ -17,6 +17,7 @@ from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import Kinematics, World
 from clamber.posture.ik import IK, ContactGoal, PostureProblem, support_rotation
+from clamber.posture.keyframe import contact_drift
 from clamber.transition import CLEARANCE, Transition, balance_problem
 
 SAFE_HEIGHT = 0.05  # [m] h_safe of (4.29)
@@ -235,12 +236,7 @@ def _free_swing(ik: IK, t: Transition) -> np.ndarray:
 def _drift(ik: IK, q: np.ndarray, contacts: tuple[Contact, ...]) -> float:
     """Largest distance of a contact from where it should be at `q` [m]."""
     ik.kin.update(q)
-    out = 0.0
-    for c in contacts:
-        n = ik.world.supports[c.support].normal
-        p = ik.kin.contact_point(c.surface, n, c.edge)
-        out = max(out, float(np.linalg.norm(p - c.position)))
-    return out
+    return max((contact_drift(ik.kin, c) for c in contacts), default=0.0)
 
 
 def _refine(ik: IK, nodes: list[np.ndarray], contacts: tuple[Contact, ...], between) -> np.ndarray:

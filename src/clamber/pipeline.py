@@ -24,7 +24,7 @@ from clamber.posture.keyframe import (
     KeyframeTask,
     finish,
 )
-from clamber.retarget import retarget
+from clamber.scaling import retarget
 from clamber.scene import GROUND, Scene
 from clamber.se3 import quat_from_matrix
 from clamber.trajectory import Trajectory, build_trajectory
@@ -373,5 +373,6 @@ def _keyframe_there(
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
     contact, solution = approach_contact(ik, task.held, wanted, q)
-    fixed = replace(task, held=(*task.held, contact), new=())
-    return METHODS[options.method](ik, fixed, solution.q, options.keyframe)
+    fixed = replace(task, new=(contact,), fixed=True)
+    key = direct.optimise(ik, fixed, solution.q, options.keyframe)
+    return replace(key, method=options.method)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -32,16 +33,8 @@ def matrix_from_quat(quat: ArrayLike) -> np.ndarray:
 
 def quat_from_matrix(R: ArrayLike) -> np.ndarray:
     """Unit quaternion (4,), w >= 0, of a rotation matrix (3, 3)."""
-    R = np.asarray(R, dtype=float)
-    K = np.array(
-        [
-            [np.trace(R), 0, 0, 0],
-            [R[2, 1] - R[1, 2], R[0, 0] - R[1, 1] - R[2, 2], 0, 0],
-            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], 0],
-            [R[1, 0] - R[0, 1], R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1]],
-        ]
-    )
-    q = np.linalg.eigh(K)[1][:, -1]  # reads the lower triangle [Bar-Itzhack00]
+    q = np.empty(4)
+    mujoco.mju_mat2Quat(q, np.ascontiguousarray(R, dtype=float).reshape(9))
     return q if q[0] >= 0 else -q
 
 
@@ -67,10 +60,9 @@ def quat_conjugate(q: ArrayLike) -> np.ndarray:
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
     """Rotation vector (3,) of a rotation matrix (3, 3) [rad]."""
-    w, *v = quat_from_matrix(R)
-    v = np.array(v)
-    n = float(np.linalg.norm(v))
-    return 2.0 * v if n < 1e-12 else v * (2.0 * np.arctan2(n, w) / n)
+    out = np.empty(3)
+    mujoco.mju_quat2Vel(out, quat_from_matrix(R), 1.0)
+    return out
 
 
 def frame_from_normal(normal: ArrayLike, heading: ArrayLike) -> np.ndarray:

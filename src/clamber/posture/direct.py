@@ -15,6 +15,7 @@ from clamber.posture.keyframe import (
     KeyframeOptions,
     KeyframeTask,
     finish,
+    held_goal,
     keyframe_problem,
     stability_cost,
 )
@@ -27,7 +28,9 @@ def optimise(ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions
     references = np.array([c.position for c in task.new]).reshape(-1, 3)
     before, _ = stability_cost(ik.kin, task, references, options.stability_weight)
     goals = tuple(
-        ContactGoal(
+        held_goal(world, c)
+        if task.fixed
+        else ContactGoal(
             surface=c.surface,
             support=c.support,
             position=c.position,

@@ -61,6 +61,8 @@ class ContactGoal:
             it supports; only for free contacts.
         reference: Weight of the distance to `position`; free contacts and moving ones.
         edge: The edge that a held flat surface may roll on; None keeps it flat.
+        link: (4,) orientation of the link from which a held round surface rolls; None
+            keeps its centre over `position`.
     """
 
     surface: str
@@ -73,6 +75,7 @@ class ContactGoal:
     stability: float = 0.0
     reference: float = 0.0
     edge: int | None = None
+    link: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -399,7 +402,8 @@ class IK:
                 A, b = self._edges[g.support]
                 error = max(error, float((points @ A.T - b).max()))
             else:
-                error = float(np.linalg.norm(p - g.position))
+                target = g.position + kin.roll(g.surface, support.normal, g.link)
+                error = float(np.linalg.norm(p - target))
             if s.is_flat:
                 turn = kin.flat_error(g.surface, g.rotation)
                 if g.free:
@@ -433,9 +437,10 @@ class IK:
         n = support.normal
         p = kin.contact_point(g.surface, n, g.edge)
         jac, rot = kin.jacobians(s.body, p)
-        if s.radius > 0:
+        if s.radius > 0 and g.link is None:
             # The touching point of a ball stays under its centre: it moves as that does.
             jac = kin.point_jacobian(s.body, p + s.radius * n)
+        target = g.position + kin.roll(g.surface, n, g.link)
         if not g.hard:
             self._target(jac, p - g.position, g.reference)
             if s.is_flat:
@@ -455,10 +460,10 @@ class IK:
             return
         if not g.free:
             m = 6 if s.is_flat else 3
-            self._violation += _size(g.position - p)
+            self._violation += _size(target - p)
             k = self._hard.take(m)
             self._hard.J[k.start : k.start + 3] = jac
-            self._hard.lo[k.start : k.start + 3] = _clip(g.position - p)
+            self._hard.lo[k.start : k.start + 3] = _clip(target - p)
             if s.is_flat:
                 turn = kin.flat_error(g.surface, g.rotation)
                 self._violation += _size(turn)

@@ -56,11 +56,13 @@ class KeyframeTask:
         directions: Demonstrated body segments, unit vectors in the world.
         q_reference: (nq,) the posture to stay close to where nothing else decides.
         base_rotation: (3, 3) preferred R_WB.
+        fixed: The new contacts' positions are not references but where they are.
     """
 
     held: tuple[Contact, ...]
     new: tuple[Contact, ...]
     q_reference: np.ndarray
+    fixed: bool = False
     directions: Mapping[str, np.ndarray] = field(default_factory=lambda: MappingProxyType({}))
     base_rotation: np.ndarray | None = None
 
@@ -140,6 +142,7 @@ def held_goal(world: World, c: Contact, *, loaded: bool = True) -> ContactGoal:
         rotation=support_rotation(world.supports[c.support], c.quaternion),
         loaded=loaded,
         edge=c.edge,
+        link=c.link,
     )
 
 
@@ -262,8 +265,9 @@ def finish(
 ) -> Keyframe:
     """Measure a posture: contacts where they are, margins, equilibrium, status.
 
-    A posture counts as stable when every constraint holds, its new contacts support
-    their masses and static equilibrium is feasible.
+    Geometry proposes and statics verifies: a posture counts as stable when every
+    constraint holds and forces within friction cones and torque limits exist. Where they
+    do not and a new contact is past its contact angle, that is named as the reason.
     """
     world = ik.world
     kin = ik.kin
@@ -274,6 +278,7 @@ def finish(
             support=c.support,
             position=p,
             quaternion=_orientation(kin, c),
+            link=quat_from_matrix(kin.rotation(world.surfaces[c.surface].body)),
         )
         for c, p in zip(task.new, new_positions(kin, task), strict=True)
     )
@@ -287,12 +292,9 @@ def finish(
     equilibrium = equilibrium_at(kin, measured.held)
     status = residuals.status
     fresh = {c.surface for c in task.new}
-    if status is Status.SOLVED and any(
-        s.phase == "sliding" and s.contact.surface in fresh for s in states
-    ):
-        status = Status.SLIDING
     if status is Status.SOLVED and not equilibrium.feasible:
-        status = Status.OVERLOADED
+        slides = any(s.phase == "sliding" and s.contact.surface in fresh for s in states)
+        status = Status.SLIDING if slides else Status.OVERLOADED
     return Keyframe(
         q=q,
         contacts=states,
@@ -306,6 +308,13 @@ def finish(
         cost_before=cost_before,
         cost_after=cost_after,
     )
+
+
+def contact_drift(kin: Kinematics, c: Contact) -> float:
+    """Distance of a contact from where it should be at the present posture [m]."""
+    n = kin.world.supports[c.support].normal
+    p = kin.contact_point(c.surface, n, c.edge)
+    return float(np.linalg.norm(p - c.position - kin.roll(c.surface, n, c.link)))
 
 
 def _orientation(kin: Kinematics, c: Contact) -> np.ndarray:
