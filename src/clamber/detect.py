@@ -339,9 +339,11 @@ def _part_intervals(
             )
             t0, t1 = float(demo.t[0]), float(demo.t[-1])
             if i > 0:  # the part touches with the first of its points
-                t0 = min(_refine(tracks, p, i, j, leaving=False) for p in firsts)
+                t0 = min(
+                    _refine(tracks, p, support, i, j, leaving=False) for p in firsts
+                )
             if j < len(demo.t):
-                t1 = max(_refine(tracks, p, i, j, leaving=True) for p in lasts)
+                t1 = max(_refine(tracks, p, support, i, j, leaving=True) for p in lasts)
             if t1 - t0 < options.min_duration:
                 continue
             base, tip = _limb_ends(demo, part)
@@ -366,13 +368,15 @@ def _join(
 _REST = 0.3  # [s] from whose median a resting place is read
 _SEARCH = 0.5  # [s] a change lies at most so far inside its coarse interval
 _AROUND = 0.1  # [s] half the stretch of track that the fit looks at
-_STILL = 0.006  # [m] nobody holds a part stiller than this
+_STILL = 0.015  # [m] a part that rolls in place changes height by less than this
 
 
-def _refine(tracks: _Tracks, point: str, i: int, j: int, *, leaving: bool) -> float:
+def _refine(
+    tracks: _Tracks, point: str, support: Support, i: int, j: int, *, leaving: bool
+) -> float:
     """Instant [s] at which a point comes to rest at the start of [i, j), or leaves.
 
-    First the last sample away from where the point rests, then the least-squares
+    First the last sample that is not at the height at which the point rests, then the least-squares
     instant t of `p(t + s) = rest + a (-s)+ + b (-s)+^2`: still after t, not before.
     Leaving is the same seen backwards in time.
     """
@@ -385,10 +389,11 @@ def _refine(tracks: _Tracks, point: str, i: int, j: int, *, leaving: bool) -> fl
     if not valid[max(i - 1, 0)]:  # the view begins here, not the contact
         return float(demo.t[n - 1 - i] if leaving else demo.t[i])
     ahead = min(i + round(_SEARCH * rate), (i + j) // 2)
-    rest = np.median(raw[ahead : min(ahead + round(_REST * rate), j)], axis=0)
+    raw_height, height = support.height(raw), support.height(smooth)
+    rest = np.median(raw_height[ahead : min(ahead + round(_REST * rate), j)])
     still = max(_STILL, 4.5 * _noise(raw) / 2.0)  # smoothing halves the noise
     start = max(i - round(_AROUND * rate), 0)
-    away = np.linalg.norm(smooth[start : ahead + 1] - rest, axis=1) > still
+    away = np.abs(height[start : ahead + 1] - rest) > still
     moving = np.flatnonzero(away)
     k = start + int(moving[-1]) if len(moving) else i
     k = _fit_instant(raw, min(k, ahead), round(_AROUND * rate))

@@ -54,7 +54,8 @@ class ClimbOptions:
         noise: Standard deviation of a marker's coordinates [m].
         gaps: How many short stretches of markers are missing.
         rate: [Hz].
-        near_face: From the ankles to the box [m].
+        near_face: From the ankles to the box [m]; by default 0.42, more before a low
+            box, where knees that bend need the room.
         hand: Wrist's depth behind the near edge and distance to the side [m].
         elbow_side: Elbow's distance to the side [m]; its depth follows, since the
             forearm lies down around the hand, which stays where it is.
@@ -67,7 +68,7 @@ class ClimbOptions:
     noise: float = 0.002
     gaps: int = 6
     rate: float = 120.0
-    near_face: float = 0.42
+    near_face: float | None = None
     hand: tuple[float, float] = (0.41, 0.06)
     elbow_side: float = 0.255
     knee: tuple[float, float] = (0.15, 0.165)
@@ -76,6 +77,13 @@ class ClimbOptions:
     def height(self) -> float:
         """Of the box [m]."""
         return self.height_ratio * KNEE_HEIGHT
+
+    @property
+    def edge(self) -> float:
+        """Depth of the near edge [m]."""
+        if self.near_face is not None:
+            return self.near_face
+        return 0.42 + 0.6 * max(0.0, 0.47 - self.height)
 
 
 # Names of the key poses, when each is reached [s] and what has just happened.
@@ -132,7 +140,7 @@ def synthesize_climb(
 
 def _scene(o: ClimbOptions) -> Scene:
     size = np.array([BOX_WIDTH, BOX_LENGTH, o.height])
-    position = np.array([o.near_face + BOX_WIDTH / 2, 0.0, o.height / 2])
+    position = np.array([o.edge + BOX_WIDTH / 2, 0.0, o.height / 2])
     box = Box(name="table", size=size, position=position, rotation=np.eye(3))
     return Scene(boxes=(box,), start=np.zeros(3))
 
@@ -154,7 +162,7 @@ class _Holds:
 
 def _holds(o: ClimbOptions) -> _Holds:
     """Contacts of both sides; the elbow lies a forearm's length from the wrist."""
-    h, edge = o.height, o.near_face
+    h, edge = o.height, o.edge
     across = o.elbow_side - o.hand[1]
     along = np.sqrt(FOREARM**2 - across**2 - (ELBOW - WRIST) ** 2)
     holds = _Holds({}, {}, {}, {}, {})
@@ -251,7 +259,7 @@ def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
     Depths are from the ankles, heights relative to the box as far as legs allow.
     """
     h, sign = o.height, _SIGN[first]
-    x = o.near_face
+    x = o.edge
     wrist = x + o.hand[0]
     tall = ANKLE + SHANK + THIGH
     hips = min(0.85, h + 0.38)
@@ -261,7 +269,7 @@ def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
         "ready": (0.02, 0, tall - 0.004, 0.0, 0.02, 0, tall + TRUNK - 0.01, 0.0, 0),
         "first hand": (0.12, 0, hips, 0.7, wrist - 0.24, 0, h + 0.54, 1.1, 0.12),
         "second hand": (0.14, 0, hips, 0.8, wrist - 0.21, 0, h + 0.50, 1.2, 0),
-        "first elbow": (0.18, 0, hips, 0.9, wrist - 0.12, 0.0, h + 0.38, 1.4, 0.2),
+        "first elbow": (0.18, 0, hips, 0.9, wrist - 0.12, 0, h + 0.43, 1.4, 0.6),
         "second elbow": (0.21, 0, hips, 1.0, wrist - 0.10, 0, h + 0.32, 1.5, 0),
         "first toe-off": (0.24, -0.04, hips, 1.0, wrist - 0.07, 0, h + 0.32, 1.5, 0),
         "first knee": (0.29, -0.02, h + 0.37, 1.0, wrist - 0.04, 0, h + 0.31, 1.5, 0),
@@ -408,9 +416,10 @@ def _clean_motion(
     tau = (t - at[phase]) / np.diff(at)[phase]
 
     key_pitch = {s: np.zeros(len(at)) for s in SIDES}
+    tall = np.clip((o.height - 0.1) / 0.4, 0.0, 1.0)  # low boxes need no tiptoes
     for name, angles in _FOOT_PITCH.items():
         for (s, _), angle in zip(_orders(first), angles, strict=True):
-            key_pitch[s][_KEY[name]] = angle
+            key_pitch[s][_KEY[name]] = tall * angle
     pitch = {
         s: k[phase] + (k[phase + 1] - k[phase]) * _ease(tau)
         for s, k in key_pitch.items()
@@ -494,12 +503,13 @@ def _arm(
     wrist = _reach(shoulder, wrist, 0.995 * (UPPER_ARM + FOREARM))
     wrist[clock.since(hand)] = hold
 
-    propped = np.array([-0.5, sign * 1.0, 0.1])
+    propped = np.array([-0.35, sign * 1.0, 1.3])
     middle = (_joint(keys[_KEY[elbow]], f"{s}Shoulder") + hold) / 2
     pole = _blend(
         np.array([-1.0, sign * 0.3, 0.0]), propped, _ease(clock.part("ready", hand))
     )
-    down = _hit(clock.part(hand if order == "second" else "second hand", elbow))
+    before = "second hand" if order == "first" else "first elbow"
+    down = _hit((clock.part(before, elbow) - 0.7) / 0.3)  # lean first, then let go
     pole = _blend(pole, holds.elbow[s] - middle, down)
     joint = _bend(shoulder, wrist, UPPER_ARM, FOREARM, pole)
     joint[clock.since(elbow)] = holds.elbow[s]
@@ -543,7 +553,7 @@ def _leg(
 
     goes = clock.part(off, on)
     path = knee0 + (holds.knee[s] - knee0) * _hit(goes)[:, None]
-    path[:, 2] += 0.14 * _hop(goes)
+    path[:, 2] += 0.24 * _hop(goes)
     swing = hip + THIGH * _unit(path - hip)
     swing[clock.since(on)] = holds.knee[s]
     lying = np.array([-1.0, 0.0, -0.12])
