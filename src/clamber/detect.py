@@ -376,7 +376,7 @@ def _refine(
 ) -> float:
     """Instant [s] at which a point comes to rest at the start of [i, j), or leaves.
 
-    First the last sample that is not at the height at which the point rests, then the least-squares
+    First the last sample that is not where the point rests, then the least-squares
     instant t of `p(t + s) = rest + a (-s)+ + b (-s)+^2`: still after t, not before.
     Leaving is the same seen backwards in time.
     """

@@ -509,7 +509,7 @@ def _arm(
         np.array([-1.0, sign * 0.3, 0.0]), propped, _ease(clock.part("ready", hand))
     )
     before = "second hand" if order == "first" else "first elbow"
-    down = _hit((clock.part(before, elbow) - 0.7) / 0.3)  # lean first, then let go
+    down = _hit((clock.part(before, elbow) - 0.7) / 0.3, 2.0)  # lean first, then let go
     pole = _blend(pole, holds.elbow[s] - middle, down)
     joint = _bend(shoulder, wrist, UPPER_ARM, FOREARM, pole)
     joint[clock.since(elbow)] = holds.elbow[s]
@@ -553,7 +553,7 @@ def _leg(
 
     goes = clock.part(off, on)
     path = knee0 + (holds.knee[s] - knee0) * _hit(goes)[:, None]
-    path[:, 2] += 0.24 * _hop(goes)
+    path[:, 2] += 0.28 * _hop(goes)
     swing = hip + THIGH * _unit(path - hip)
     swing[clock.since(on)] = holds.knee[s]
     lying = np.array([-1.0, 0.0, -0.12])
