@@ -16,7 +16,7 @@ Shapes: T samples.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -137,7 +137,9 @@ def detect_contacts(
     found = [
         interval
         for part in PARTS
-        for interval in _part_intervals(tracks, part, near, windows, scene, options)
+        for interval in _apart(
+            _part_intervals(tracks, part, near, windows, scene, options)
+        )
     ]
     if not found:
         raise InputError(
@@ -333,9 +335,10 @@ def _part_intervals(
         for i, j in _hysteresis(
             strict.any(axis=0), either, options.min_duration * demo.rate
         ):
+            some = round(options.smoothing * demo.rate)
             firsts, lasts = (
-                [p for p, ok in zip(points, loose[:, m], strict=True) if ok]
-                for m in (i, j - 1)
+                [p for p, ok in zip(points, loose[:, m].any(axis=1), strict=True) if ok]
+                for m in (slice(i, min(i + some, j)), slice(max(j - some, i), j))
             )
             t0, t1 = float(demo.t[0]), float(demo.t[-1])
             if i > 0:  # the part touches with the first of its points
@@ -350,6 +353,19 @@ def _part_intervals(
             yield _interval(
                 tracks, part, part, support, i, j - 1, np.array([t0, t1]), base, tip
             )
+
+
+def _apart(intervals: Iterable[ContactInterval]) -> list[ContactInterval]:
+    """Intervals of one part by start time; where two overlap they meet halfway."""
+    out: list[ContactInterval] = []
+    for b in sorted(intervals, key=lambda i: (i.t0, i.t1)):
+        if out and out[-1].t1 > b.t0:
+            if b.t1 <= out[-1].t1:
+                continue
+            middle = (out[-1].t1 + b.t0) / 2.0
+            out[-1], b = replace(out[-1], t1=middle), replace(b, t0=middle)
+        out.append(b)
+    return out
 
 
 def _join(

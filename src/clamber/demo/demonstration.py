@@ -184,7 +184,7 @@ def _fill(
             position[~ok, f] = raw[ok, f]
         for i, j in missing:
             at_edge = i == 0 or j == len(t)
-            filled = not at_edge and (j - i) * dt <= max_gap + 1e-9
+            filled = not at_edge and bool((j - i) * dt <= max_gap + 1e-9)
             valid[i:j, f] = filled
             gaps.append(
                 Gap(point=name, t0=float(t[i]), t1=float(t[j - 1]), filled=filled)

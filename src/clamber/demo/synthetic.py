@@ -92,7 +92,9 @@ _KEYS = (
     ("ready", 1.4),
     ("first hand", 3.2),
     ("second hand", 5.0),
+    ("first lean", 6.2),
     ("first elbow", 7.0),
+    ("second lean", 8.2),
     ("second elbow", 9.0),
     ("first toe-off", 10.5),
     ("first knee", 12.2),
@@ -288,6 +290,7 @@ def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
         "settled": (0.31, 0, h + 0.375, 1.0, wrist - 0.03, 0, h + 0.30, 1.45, 0),
         "end": (0.31, 0, h + 0.375, 1.0, wrist - 0.03, 0, h + 0.30, 1.45, 0),
     }
+    rows["first lean"], rows["second lean"] = rows["second hand"], rows["first elbow"]
     out = np.zeros((len(_KEYS), 12))
     for name, (px, py, pz, pp, cx, cy, cz, cp, roll) in rows.items():
         late = x - 0.42 if _KEY[name] >= _KEY["first knee"] else 0.0
@@ -323,6 +326,12 @@ def _hop(tau: np.ndarray) -> np.ndarray:
     """A bump of height 1: off within a few per cent of the time, down with speed."""
     tau = np.clip(tau, 0.0, 1.0)
     return 4.0 * tau * (1.0 - tau) * (1.0 - np.exp(-tau / 0.03))
+
+
+def _kick(tau: np.ndarray) -> np.ndarray:
+    """From 0, fast within a few per cent of the time, to rest at 1."""
+    tau = np.clip(tau, 0.0, 1.0)
+    return tau * (2.0 - tau) * (1.0 - np.exp(-tau / 0.03))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
@@ -430,7 +439,9 @@ def _clean_motion(
         now = {s: x[k : k + 1] for s, x in key_pitch.items()}
         held = _held_from(k, o, first, now, leaving=True)
         keys[k] = _settle(keys[k : k + 1], held, trunk=True)[0]
-    body = keys[phase] + (keys[phase + 1] - keys[phase]) * _ease(tau)[:, None]
+    drops = np.isin(phase + 1, [_KEY["first elbow"], _KEY["second elbow"]])
+    share = np.where(drops, _hit(tau), _ease(tau))  # the elbow catches the chest
+    body = keys[phase] + (keys[phase + 1] - keys[phase]) * share[:, None]
     body += np.sin(np.pi * tau)[:, None] ** 2 * _sway(rng, t)
     for k in range(len(at) - 1):
         m = phase == k
@@ -508,8 +519,7 @@ def _arm(
     pole = _blend(
         np.array([-1.0, sign * 0.3, 0.0]), propped, _ease(clock.part("ready", hand))
     )
-    before = "second hand" if order == "first" else "first elbow"
-    down = _hit((clock.part(before, elbow) - 0.7) / 0.3, 2.0)  # lean first, then let go
+    down = _hit(clock.part(f"{order} lean", elbow))
     pole = _blend(pole, holds.elbow[s] - middle, down)
     joint = _bend(shoulder, wrist, UPPER_ARM, FOREARM, pole)
     joint[clock.since(elbow)] = holds.elbow[s]
@@ -557,7 +567,7 @@ def _leg(
     swing = hip + THIGH * _unit(path - hip)
     swing[clock.since(on)] = holds.knee[s]
     lying = np.array([-1.0, 0.0, -0.12])
-    swing_ankle = swing + SHANK * _blend(ankle0 - knee0, lying, _ease(goes))
+    swing_ankle = swing + SHANK * _blend(ankle0 - knee0, lying, _kick(goes))
     length = np.linalg.norm(holds.toe[s] - holds.ankle[s])
     hanging = np.array([-0.45, 0.0, -0.9])
     swing_toe = swing_ankle + length * _blend(toe0 - ankle0, hanging, _ease(goes))
