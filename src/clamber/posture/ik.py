@@ -32,12 +32,11 @@ from clamber.statics import com_margin, polygon_halfplanes, support_ellipse, sup
 
 STEP_ROTATION = 0.15  # [rad] largest joint step of one iteration
 STEP_TRANSLATION = 0.08  # [m] largest step of the base
-CONTACT_STEP = 0.05  # [m, rad] largest contact error asked for in one iteration
-DISTANCE_STEP = 0.03  # [m] deepest recovery from a collision in one iteration
+RECOVERY_STEP = 0.05  # [m, rad] of a violation that one step is asked to make good
 ACTIVE_RANGE = 0.10  # [m] farther pairs have no row
 DAMPING = 2e-4  # mu
 MIN_RADIUS = 1e-3  # of the trust region, where the solve has stalled
-PENALTY = 300.0  # of violations against the soft cost, in the merit of a step
+PENALTY = 1e6  # of violations against the soft cost, in the merit of a step
 CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
@@ -306,12 +305,11 @@ class IK:
             diagonal[w.dadr] += weight
         H[np.diag_indices(nv)] += diagonal
 
-        lo, hi = -self._step, self._step.copy()
+        lo, hi = np.full(nv, -1e30), np.full(nv, 1e30)
         k = self._limited
         now = q[self._q_of_dof[k]]
-        lo[k] = np.maximum(lo[k], w.q_min[k] - now)
-        hi[k] = np.minimum(hi[k], w.q_max[k] - now)
-        hi = np.maximum(hi, lo)
+        lo[k] = np.minimum(w.q_min[k] - now, 0.0)
+        hi[k] = np.maximum(w.q_max[k] - now, 0.0)
         return QP(
             H=H,
             c=c,
@@ -321,7 +319,7 @@ class IK:
             sense=np.concatenate(
                 [np.zeros(nv, np.int32), np.full(hard.n, EQUALITY, np.int32), np.full(ineq.n, SOFT, np.int32)]
             ),
-            merit=cost + PENALTY * self._violation,
+            merit=cost + 0.5 * PENALTY * self._violation,
         )
 
     def step(self, qp: QP, radius: float = 1.0) -> np.ndarray:
@@ -332,16 +330,21 @@ class IK:
             radius: Share of the largest step that this one may take.
         """
         nv = len(qp.c)
-        lo, hi = qp.lo, qp.hi
-        if radius < 1.0:
-            lo, hi = lo.copy(), hi.copy()
-            lo[:nv] = np.maximum(lo[:nv], -radius * self._step)
-            hi[:nv] = np.minimum(hi[:nv], radius * self._step)
+        lo, hi = qp.lo.copy(), qp.hi.copy()
+        lo[:nv] = np.maximum(lo[:nv], -radius * self._step)
+        hi[:nv] = np.minimum(hi[:nv], radius * self._step)
+        # What is violated is asked to recover only as far as such a step can reach:
+        # then every step, however short, points the right way.
+        lo[nv:] = np.minimum(lo[nv:], radius * RECOVERY_STEP)
+        hi[nv:] = np.maximum(hi[nv:], -radius * RECOVERY_STEP)
+        hard = slice(nv, nv + int(np.count_nonzero(qp.sense == EQUALITY)))
+        lo[hard] = np.maximum(lo[hard], -radius * RECOVERY_STEP)
+        hi[hard] = np.minimum(hi[hard], radius * RECOVERY_STEP)
         x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, hi, lo, qp.sense)
         if flag > 0:
             return x
-        m = int(np.count_nonzero(qp.sense == EQUALITY))
-        J, e = qp.A[:m], -qp.lo[nv : nv + m]
+        m = hard.stop - nv
+        J, e = qp.A[:m], -lo[hard]
         keep = np.r_[0:nv, nv + m : len(qp.lo)]
         x, _, flag, _ = daqp.solve(
             qp.H + 1e4 * J.T @ J,
@@ -416,8 +419,8 @@ class IK:
         near = kin.proximity(0.02, np.isfinite(problem.clearance))
         short = problem.clearance[near.pairs] - near.distance
         worst = int(np.argmax(short)) if len(short) else -1
-        polygon = self._polygon(problem)
-        margin = com_margin(kin.com[:2], polygon) if len(polygon) else -np.inf
+        _, points = self._bearing(problem)
+        margin = com_margin(kin.com[:2], support_polygon(points[:, :2])) if len(points) else -np.inf
         dof = w.dadr
         over = np.maximum(w.q_min[dof] - q[w.qadr], q[w.qadr] - w.q_max[dof])
         return Residuals(
@@ -453,9 +456,9 @@ class IK:
             self._violation += _size(g.position - p) + _size(across @ turn)
             k = self._hard.take(5)
             self._hard.J[k.start : k.start + 3] = jac
-            self._hard.lo[k.start : k.start + 3] = _clip(g.position - p)
+            self._hard.lo[k.start : k.start + 3] = g.position - p
             self._hard.J[k.start + 3 : k.stop] = across @ rot
-            self._hard.lo[k.start + 3 : k.stop] = _clip(across @ turn)
+            self._hard.lo[k.start + 3 : k.stop] = across @ turn
             self._target(axis[None] @ rot, -(axis @ turn)[None], FLAT_WEIGHT)
             return
         if not g.free:
@@ -463,24 +466,24 @@ class IK:
             self._violation += _size(target - p)
             k = self._hard.take(m)
             self._hard.J[k.start : k.start + 3] = jac
-            self._hard.lo[k.start : k.start + 3] = _clip(target - p)
+            self._hard.lo[k.start : k.start + 3] = target - p
             if s.is_flat:
                 turn = kin.flat_error(g.surface, g.rotation)
                 self._violation += _size(turn)
                 self._hard.J[k.start + 3 : k.stop] = rot
-                self._hard.lo[k.start + 3 : k.stop] = _clip(turn)
+                self._hard.lo[k.start + 3 : k.stop] = turn
             return
         k = self._hard.take(3 if s.is_flat else 1)
-        self._violation += abs(float(support.height(p)))
+        self._violation += float(support.height(p)) ** 2
         self._hard.J[k.start] = n @ jac
-        self._hard.lo[k.start] = np.clip(-support.height(p), -CONTACT_STEP, CONTACT_STEP)
+        self._hard.lo[k.start] = -support.height(p)
         A, b = self._edges[g.support]
         if s.is_flat:
             turn = kin.flat_error(g.surface, g.rotation)
             R = support.rotation
             self._violation += _size(R[:, :2].T @ turn)
             self._hard.J[k.start + 1 : k.stop] = R[:, :2].T @ rot
-            self._hard.lo[k.start + 1 : k.stop] = _clip(R[:, :2].T @ turn)
+            self._hard.lo[k.start + 1 : k.stop] = R[:, :2].T @ turn
             self._target(n[None] @ rot, -(n @ turn)[None], 0.3)
             for corner in kin.bearing_points(g.surface, n):
                 self._inside(A, b, corner, kin.point_jacobian(s.body, corner))
@@ -508,10 +511,10 @@ class IK:
         near = room < 0.15
         if not near.any():
             return
-        self._violation += float(np.maximum(-room[near], 0.0).sum())
+        self._violation += _size(np.minimum(room[near], 0.0))
         k = self._ineq.take(int(near.sum()))
         self._ineq.J[k] = A[near] @ jac
-        self._ineq.hi[k] = np.maximum(room[near], -CONTACT_STEP)
+        self._ineq.hi[k] = room[near]
         self._ineq.lo[k] = -1e30
 
     def _target(self, J: np.ndarray, e: np.ndarray, weight: float) -> None:
@@ -545,28 +548,67 @@ class IK:
             kin.point_jacobian(body_a, a, self._jac2)
             self._target((self._jac - self._jac2) / length, (b - a) / length - u, problem.direction_weight)
 
-    def _polygon(self, problem: PostureProblem) -> np.ndarray:
-        points = [
-            self.kin.bearing_points(g.surface, self.world.supports[g.support].normal, g.edge)
-            for g in problem.goals
-            if g.hard and g.loaded
-        ]
-        if not points:
-            return np.zeros((0, 2))
-        return support_polygon(np.concatenate(points)[:, :2])
+    def _bearing(self, problem: PostureProblem) -> tuple[list[int], np.ndarray]:
+        """Body of each point that bears load, -1 where it stays put, and (n, 3) points."""
+        bodies, points = [], []
+        for g in problem.goals:
+            if not (g.hard and g.loaded):
+                continue
+            p = self.kin.bearing_points(g.surface, self.world.supports[g.support].normal, g.edge)
+            s = self.world.surfaces[g.surface]
+            bodies += [s.body if g.free or not s.is_flat else -1] * len(p)
+            points.append(p)
+        return bodies, np.concatenate(points) if points else np.zeros((0, 3))
+
+    def _polygon_motion(
+        self,
+        A: np.ndarray,
+        polygon: np.ndarray,
+        com: np.ndarray,
+        bodies: list[int],
+        points: np.ndarray,
+        rows: np.ndarray,
+    ) -> None:
+        """Let the polygon's edges move with contacts that slide or roll.
+
+        The distance of c from the line through p and q changes by
+        n'((1 - t) dp + t dq - dc), t the share of the edge at which c lies abreast.
+        """
+        if all(b < 0 for b in bodies):
+            return
+        kin = self.kin
+        gaps = np.abs(polygon[:, None] - points[None, :, :2]).sum(axis=2)
+        owner = np.argmin(gaps, axis=1)
+        jacobians: dict[int, np.ndarray] = {}
+        for i in {int(o) for o in owner if bodies[int(o)] >= 0}:
+            # A ball's contact stays under its centre, a corner is a point of its link.
+            s = next(x for x in self.world.surfaces.values() if x.body == bodies[i])
+            centre = points[i] + [0.0, 0.0, s.radius] if not s.is_flat else points[i]
+            jacobians[i] = kin.point_jacobian(bodies[i], centre)[:2].copy()
+        for e in range(len(A)):
+            p, q = polygon[e], polygon[(e + 1) % len(polygon)]
+            along = q - p
+            t = float((com - p) @ along) / float(along @ along)
+            for share, vertex in ((1.0 - t, owner[e]), (t, owner[(e + 1) % len(polygon)])):
+                J = jacobians.get(int(vertex))
+                if J is not None:
+                    rows[e] -= share * (A[e] @ J)
 
     def _balance_rows(self, problem: PostureProblem) -> None:
-        polygon = self._polygon(problem)
-        if len(polygon) < 3:
+        bodies, points = self._bearing(problem)
+        if not bodies:
             return
+        polygon = support_polygon(points[:, :2])
         com = self.kin.com[:2].copy()
-        J = self.kin.com_jacobian()[:2]
+        J = self.kin.com_jacobian()[:2].copy()
         A, b = polygon_halfplanes(polygon)
         room = b - problem.balance_margin - A @ com
-        self._violation += max(float(-room.min()), 0.0)
+        self._violation += _size(np.minimum(room, 0.0))
         k = self._ineq.take(len(b))
         self._ineq.J[k] = A @ J
-        self._ineq.hi[k] = np.maximum(room, -CONTACT_STEP)
+        if len(polygon) == len(b):
+            self._polygon_motion(A, polygon, com, bodies, points, self._ineq.J[k])
+        self._ineq.hi[k] = room
         self._ineq.lo[k] = -1e30
         if problem.com_weight > 0:
             self._target(J, com - polygon.mean(axis=0), problem.com_weight)
@@ -604,20 +646,14 @@ class IK:
             else:
                 self._ineq.J[row] = -n @ kin.point_jacobian(int(a), p1)
         short = clearance[near.pairs] - near.distance
-        self._violation += float(np.maximum(short, 0.0).sum())
-        self._ineq.lo[k] = np.minimum(short, DISTANCE_STEP)
+        self._violation += _size(np.maximum(short, 0.0))
+        self._ineq.lo[k] = short
         self._ineq.hi[k] = 1e30
 
 
 def _size(e: np.ndarray) -> float:
-    """Euclidean length."""
-    return float(np.sqrt(e @ e))
-
-
-def _clip(e: np.ndarray) -> np.ndarray:
-    """Shorten an error vector to what one iteration may ask for."""
-    n = float(np.linalg.norm(e))
-    return e if n <= CONTACT_STEP else e * (CONTACT_STEP / n)
+    """Squared Euclidean length."""
+    return float(e @ e)
 
 
 def support_rotation(support: Support, quaternion: np.ndarray) -> np.ndarray:
