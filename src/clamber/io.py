@@ -1,0 +1,952 @@
+"""Run folders: every record of a job on disk, and back.
+
+A file is written beside its place and renamed, so that an interrupted run leaves whole
+files only. The same records give the same bytes: JSON keeps the order in which it is
+written and floats in their shortest exact form, and numpy dates what lies in an `.npz`
+1980. Seconds that something took go to `timings.json` alone.
+
+Shapes: T samples, nS surfaces, nc bearing points, N steps, M recorded states.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import IO, Any, Literal, TypeVar, get_args, get_type_hints
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pydantic
+
+import clamber.model
+from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.errors import InputError, Status
+from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
+from clamber.pipeline import Plan, PlanOptions, Skipped
+from clamber.posture.ik import Residuals
+from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
+from clamber.scene import Box, Scene
+from clamber.se3 import matrix_from_rpy
+from clamber.simulation import Criterion, Rollout, Verdict
+from clamber.statics import Phase, StaticEquilibrium
+from clamber.trajectory import Trajectory
+
+VERSION = 1
+SEQUENCE = "sequence.json"
+PLAN = "plan.json"
+TRAJECTORY = "trajectory.npz"
+SCENE = "scene.xml"
+ASSETS = "assets"
+TIMINGS = "timings.json"
+ROLLOUT = "rollout.npz"
+VERDICT = "verdict.json"
+VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
+_OF_AN_EARLIER_PLAN = (TRAJECTORY, ROLLOUT, VERDICT, TIMINGS)
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    zipfile.BadZipFile,
+    zlib.error,
+    NotImplementedError,
+)
+_Model = TypeVar("_Model", bound=pydantic.BaseModel)
+_Record = TypeVar("_Record")
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+# Folders and whole files.
+
+
+def new_run_folder(out: Path | None, command: str) -> Path:
+    """Make the folder of a run.
+
+    Args:
+        out: The folder asked for, which may exist; None for `runs/<command>` below the
+            current folder, or the first of `-2`, `-3` ... that is free.
+        command: Such as `climb`.
+
+    Raises:
+        InputError: It cannot be made, or nothing can be written into it.
+    """
+    try:
+        if out is not None:
+            folder = Path(out)
+            folder.mkdir(parents=True, exist_ok=True)
+        else:
+            folder = _next_free(Path("runs"), command)
+        with _whole(folder / ".writable"):
+            pass
+        (folder / ".writable").unlink()
+    except OSError as e:
+        raise InputError(
+            f"a folder that can be written ({e.strerror or e})",
+            source="--out",
+            value=str(out if out is not None else Path("runs") / command),
+        ) from e
+    return folder
+
+
+def _next_free(parent: Path, command: str) -> Path:
+    parent.mkdir(parents=True, exist_ok=True)
+    n = 1
+    while True:
+        folder = parent / (command if n == 1 else f"{command}-{n}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()  # of two runs that begin at once, one makes it
+            return folder
+        n += 1
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A name beside `path`, same ending, that becomes `path` if the block completes."""
+    draft = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        yield draft
+        os.replace(draft, path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[IO[bytes]]:
+    with whole_file(path) as draft, draft.open("wb") as stream:
+        yield stream
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON object, `version` first; numbers that are not finite become null."""
+    text = json.dumps(
+        _plain({"version": VERSION, **content}), indent=1, allow_nan=False
+    )
+    with _whole(path) as stream:
+        stream.write(_rows_on_one_line(text).encode() + b"\n")
+
+
+def _rows_on_one_line(text: str) -> str:
+    """Indented JSON with each list of numbers on a line of its own."""
+    out: list[str] = []
+    lines = iter(text.splitlines())
+    for line in lines:
+        if not line.endswith("["):
+            out.append(line)
+            continue
+        items = []
+        for item in lines:
+            word = item.strip()
+            if word[:1] not in set("-0123456789n]"):  # something nested: as it is
+                out += [line, *items, item]
+                break
+            items.append(item)
+            if word.startswith("]"):
+                out.append(line + " ".join(x.strip() for x in items[:-1]) + word)
+                break
+    return "\n".join(out)
+
+
+def _plain(x: Any) -> Any:
+    """Numbers, strings, lists and dictionaries of the same content."""
+    if isinstance(x, Mapping):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, np.ndarray):
+        return _plain(x.tolist())
+    if isinstance(x, (list, tuple)):
+        return [_plain(v) for v in x]
+    if isinstance(x, np.generic):
+        return _plain(x.item())
+    if isinstance(x, float) and not math.isfinite(x):
+        return None
+    return x
+
+
+def _read_json(path: Path, kind: type[_Model]) -> _Model:
+    """Read and check a JSON file.
+
+    Raises:
+        InputError: Missing, not JSON, another version, or a field that does not fit.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except OSError as e:
+        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+    except ValueError as e:
+        raise InputError(f"a whole JSON file ({e})", source=path) from e
+    if not isinstance(content, dict):
+        raise InputError(
+            "an object of fields", source=path, value=type(content).__name__
+        )
+    if content.get("version") != VERSION:
+        raise InputError(
+            f"version {VERSION} of the format",
+            source=path,
+            field="version",
+            value=content.get("version", "absent"),
+        )
+    try:
+        return kind.model_validate(content)
+    except pydantic.ValidationError as e:
+        raise _misfit(e, path) from e
+
+
+def _misfit(error: pydantic.ValidationError, path: Path) -> InputError:
+    """The first fault of a machine's file."""
+    first = error.errors()[0]
+    where = ".".join(str(x) for x in first["loc"])
+    if first["type"] == "missing":
+        return InputError("a value: there is none", source=path, field=where)
+    text = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    value = first.get("input")
+    if isinstance(value, (dict, list, tuple)):
+        value = f"{type(value).__name__} of {len(value)}"
+    return InputError(text, source=path, field=where, value=value)
+
+
+def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    with _whole(path) as stream:
+        np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})
+
+
+class _Arrays:
+    """The arrays of an `.npz`; what is missing or of another shape is the user's."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            with np.load(path, allow_pickle=False) as f:
+                self._arrays = {k: f[k] for k in f.files}
+        except _UNREADABLE as e:
+            reason = e.strerror if isinstance(e, OSError) and e.strerror else e
+            raise InputError(f"a whole .npz file ({reason})", source=path) from e
+
+    def get(self, name: str, *shape: int | None) -> np.ndarray:
+        """The array; None in a shape fits any length."""
+        if name not in self._arrays:
+            raise InputError("an array: there is none", source=self.path, field=name)
+        x = self._arrays[name]
+        fits = len(x.shape) == len(shape) and all(
+            n in (None, m) for n, m in zip(shape, x.shape, strict=True)
+        )
+        if not fits:
+            wanted = ", ".join("any" if n is None else str(n) for n in shape)
+            raise InputError(
+                f"({wanted})", source=self.path, field=f"shape of {name}", value=x.shape
+            )
+        if x.dtype.kind == "f" and not np.all(np.isfinite(x)):
+            raise InputError("finite numbers only", source=self.path, field=name)
+        return x
+
+
+# Scenes, contacts and sequences.
+
+
+class _BoxFile(pydantic.BaseModel):
+    name: str
+    size: Vector
+    position: Vector
+    rpy: Vector
+    friction: float
+
+
+class _GroundFile(pydantic.BaseModel):
+    friction: float
+
+
+class _SceneFile(pydantic.BaseModel):
+    ground: _GroundFile
+    boxes: list[_BoxFile]
+    start: Vector
+    goal: list[float] | None
+
+    def scene(self) -> Scene:
+        boxes = [
+            Box(
+                name=b.name,
+                size=np.array(b.size),
+                position=np.array(b.position) + [0.0, 0.0, b.size[2] / 2],
+                rotation=matrix_from_rpy(b.rpy),
+                friction=b.friction,
+            )
+            for b in self.boxes
+        ]
+        return Scene(
+            boxes=tuple(boxes),
+            ground_friction=self.ground.friction,
+            start=np.array(self.start),
+            goal=None if self.goal is None else np.array(self.goal),
+        )
+
+
+def scene_fields(scene: Scene) -> dict[str, Any]:
+    """A scene by the keys of `scene.yaml`."""
+    return {
+        "ground": {"friction": scene.ground_friction},
+        "boxes": [
+            {
+                "name": b.name,
+                "size": b.size,
+                "position": b.position - [0.0, 0.0, b.size[2] / 2],
+                "rpy": _rpy(b.rotation),
+                "friction": b.friction,
+            }
+            for b in scene.boxes
+        ],
+        "start": scene.start,
+        "goal": scene.goal,
+    }
+
+
+def _rpy(R: np.ndarray) -> list[float]:
+    """Fixed-axis angles of R = Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
+    pitch = math.atan2(-R[2, 0], math.hypot(R[0, 0], R[1, 0]))
+    if math.hypot(R[0, 0], R[1, 0]) < 1e-9:  # yaw and roll turn about the same axis
+        return [math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0]
+    angles = [math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])]
+    return [a + 0.0 for a in angles]  # no negative zeros
+
+
+class _ContactFile(pydantic.BaseModel):
+    surface: str
+    support: str
+    position: Vector
+    quaternion: Quaternion
+    edge: int | None = None
+    link: Quaternion | None = None
+
+    def contact(self) -> Contact:
+        return Contact(
+            surface=self.surface,
+            support=self.support,
+            position=np.array(self.position),
+            quaternion=np.array(self.quaternion),
+            edge=self.edge,
+            link=None if self.link is None else np.array(self.link),
+        )
+
+
+def contact_fields(c: Contact) -> dict[str, Any]:
+    """A contact by the keys of `sequence.json`; `edge` and `link` where it has them."""
+    out: dict[str, Any] = {
+        "surface": c.surface,
+        "support": c.support,
+        "position": c.position,
+        "quaternion": c.quaternion,
+    }
+    return out | {
+        k: v for k, v in (("edge", c.edge), ("link", c.link)) if v is not None
+    }
+
+
+class _StanceFile(pydantic.BaseModel):
+    t0: float
+    t1: float
+    contacts: list[_ContactFile]
+    posture: dict[str, Vector] = {}
+
+
+class _IntervalFile(_ContactFile):
+    part: str
+    is_surface: bool
+    t0: float
+    t1: float
+
+
+class _SequenceFile(pydantic.BaseModel):
+    source: str
+    subject: dict[str, float] | None
+    scene: _SceneFile
+    stances: list[_StanceFile] = pydantic.Field(min_length=1)
+    intervals: list[_IntervalFile] = []
+
+    def sequence(self, path: Path) -> ContactSequence:
+        for i, (a, b) in enumerate(zip(self.stances, self.stances[1:], strict=False)):
+            if a.t1 != b.t0:
+                raise InputError(
+                    f"the end of the stance before, {a.t1}",
+                    source=path,
+                    field=f"stances.{i + 1}.t0",
+                    value=b.t0,
+                )
+        try:
+            return ContactSequence(
+                source=self.source,
+                subject=self.subject,
+                scene=self.scene.scene(),
+                stances=tuple(
+                    Stance(
+                        contacts=tuple(c.contact() for c in s.contacts),
+                        posture={n: np.array(v) for n, v in s.posture.items()},
+                    )
+                    for s in self.stances
+                ),
+                t=np.array([s.t0 for s in self.stances] + [self.stances[-1].t1]),
+                intervals=tuple(
+                    ContactInterval(
+                        part=x.part,
+                        is_surface=x.is_surface,
+                        t0=x.t0,
+                        t1=x.t1,
+                        contact=x.contact(),
+                    )
+                    for x in self.intervals
+                ),
+            )
+        except (ValueError, KeyError) as e:
+            raise InputError(
+                f"stances that fit together ({e.args[0]})", source=path
+            ) from e
+
+
+def sequence_fields(sequence: ContactSequence) -> dict[str, Any]:
+    """A contact sequence by the keys of `sequence.json`."""
+    return {
+        "source": sequence.source,
+        "subject": sequence.subject,
+        "scene": scene_fields(sequence.scene),
+        "stances": [
+            {
+                "region": s.region,
+                "t0": sequence.t[i],
+                "t1": sequence.t[i + 1],
+                "contacts": [contact_fields(c) for c in s.contacts],
+                "posture": s.posture,
+            }
+            for i, s in enumerate(sequence.stances)
+        ],
+        "intervals": [
+            {
+                "part": x.part,
+                "is_surface": x.is_surface,
+                "t0": x.t0,
+                "t1": x.t1,
+                **contact_fields(x.contact),
+            }
+            for x in sequence.intervals
+        ],
+    }
+
+
+def save_sequence(sequence: ContactSequence, path: str | Path) -> None:
+    """Write `sequence.json`."""
+    _write_json(Path(path), sequence_fields(sequence))
+
+
+def load_sequence(path: str | Path) -> ContactSequence:
+    """Read a `sequence.json`, or that of a run folder.
+
+    Raises:
+        InputError: The file or one of its fields cannot be used.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / SEQUENCE
+    return _read_json(file, _SequenceFile).sequence(file)
+
+
+# Plans.
+
+
+class _StateFile(_ContactFile):
+    projected_distance: float
+    contact_angle: float
+    phase: Phase
+
+
+class _EquilibriumFile(pydantic.BaseModel):
+    feasible: bool
+    margin: float
+    limiting: str | None
+    forces: list[Vector]
+    torques: list[float] | None = None
+
+
+class _ResidualsFile(pydantic.BaseModel):
+    contact: float
+    distance: float
+    balance: float
+    limits: float
+    worst_pair: int
+
+
+class _KeyframeFile(pydantic.BaseModel):
+    qpos: list[float]
+    contacts: list[_StateFile]
+    com: Vector
+    com_margin: float | None
+    static_equilibrium: _EquilibriumFile
+    residuals: _ResidualsFile
+    method: str
+    iterations: int
+    cost_before: float
+    cost_after: float
+    status: str
+
+    @pydantic.field_validator("status")
+    @classmethod
+    def _known(cls, status: str) -> str:
+        if status not in Status.__members__:
+            raise ValueError(f"one of {', '.join(Status.__members__)}")
+        return status
+
+    def keyframe(self) -> Keyframe:
+        e = self.static_equilibrium
+        margin = -math.inf if self.com_margin is None else self.com_margin
+        return Keyframe(
+            q=np.array(self.qpos),
+            contacts=tuple(
+                ContactState(
+                    contact=c.contact(),
+                    projected_distance=c.projected_distance,
+                    contact_angle=c.contact_angle,
+                    phase=c.phase,
+                )
+                for c in self.contacts
+            ),
+            com=np.array(self.com),
+            com_margin=margin,
+            equilibrium=StaticEquilibrium(
+                feasible=e.feasible,
+                margin=e.margin,
+                limiting=e.limiting,
+                forces=np.array(e.forces).reshape(-1, 3),
+                torques=None if e.torques is None else np.array(e.torques),
+            ),
+            residuals=Residuals(**self.residuals.model_dump(), com_margin=margin),
+            status=Status[self.status],
+            method=self.method,
+            iterations=self.iterations,
+            cost_before=self.cost_before,
+            cost_after=self.cost_after,
+        )
+
+
+class _SkippedFile(pydantic.BaseModel):
+    stance: int
+    reason: str
+
+
+class _PlanFile(pydantic.BaseModel):
+    options: dict[str, Any]
+    robot: RobotFile
+    sequence: _SequenceFile
+    keyframes: list[_KeyframeFile] = pydantic.Field(min_length=1)
+    skipped: list[_SkippedFile]
+    complete: bool
+
+
+class _TimingsFile(pydantic.BaseModel):
+    seconds: dict[str, float]
+
+
+def save_plan(plan: Plan, folder: str | Path) -> None:
+    """Write `plan.json`, `trajectory.npz`, `scene.xml` with assets and `timings.json`.
+
+    Results that the folder holds of an earlier plan are removed. `plan.json` comes last:
+    where it is, the others are.
+    """
+    folder = Path(folder)
+    for name in (PLAN, *_OF_AN_EARLIER_PLAN):
+        (folder / name).unlink(missing_ok=True)
+    xml = _with_assets(plan.world, folder)
+    with _whole(folder / SCENE) as stream:
+        stream.write(xml.encode())
+    if plan.trajectory is not None:
+        save_trajectory(plan.trajectory, folder / TRAJECTORY)
+    save_timings(folder, plan.timings)
+    _write_json(folder / PLAN, _plan_fields(plan, folder))
+
+
+def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
+    world = plan.world
+    robot = _robot_fields(world.robot)
+    hashes = {"robot": _sha256(json.dumps(_plain(robot)).encode())}
+    for name, path in (
+        ("robot_model", world.robot.path),
+        ("sequence", folder / SEQUENCE),
+    ):
+        if path.is_file():
+            hashes[name] = _sha256(path.read_bytes())
+    kin = Kinematics(world)
+    return {
+        "complete": plan.complete,
+        "options": asdict(plan.options),
+        "versions": {n: importlib.metadata.version(n) for n in VERSIONS_OF},
+        "inputs": hashes,
+        "robot": robot,
+        "prefixes": dict(world.robot.prefixes),
+        "keyframes": [_keyframe_fields(k, kin) for k in plan.keyframes],
+        "moves": [
+            {
+                "limb": m.limb,
+                "breaks": m.breaks,
+                "makes": None if m.makes is None else contact_fields(m.makes),
+            }
+            for m in (p.transition.move for p in plan.paths)
+        ],
+        "skipped": [asdict(s) for s in plan.skipped],
+        "sequence": sequence_fields(plan.sequence)
+        | {"scene": scene_fields(world.scene)},
+    }
+
+
+def _robot_fields(robot: Robot) -> dict[str, Any]:
+    """A robot by the keys of `robot.yaml`; a built-in one's model below `robots`."""
+    built_in = robot.path.is_relative_to(ROBOTS)
+    path = robot.path.relative_to(ROBOTS) if built_in else robot.path.absolute()
+    return {
+        "version": VERSION,
+        "name": robot.name,
+        "model": path.as_posix(),
+        "base": robot.base,
+        "home": robot.home,
+        "limbs": {
+            n: {
+                "root": x.root,
+                "middle": x.middle,
+                "end": x.end,
+                "surfaces": x.surfaces,
+            }
+            for n, x in robot.limbs.items()
+        },
+        "surfaces": robot.prefixes,
+        "gains": {
+            n: dict(zip(("kp", "kd", "ki"), g, strict=True))
+            for n, g in robot.gains.items()
+        },
+    }
+
+
+def _keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
+    kin.update(k.q)
+    names, points, _, _ = bearing_frames(kin, k.stance)
+    e = k.equilibrium
+    return {
+        "qpos": k.q,
+        "contacts": [
+            contact_fields(c.contact)
+            | {
+                "projected_distance": c.projected_distance,
+                "contact_angle": c.contact_angle,
+                "phase": c.phase,
+            }
+            for c in k.contacts
+        ],
+        "com": k.com,
+        "com_margin": k.com_margin,
+        "static_equilibrium": {
+            "feasible": e.feasible,
+            "margin": e.margin,
+            "limiting": e.limiting,
+            "surfaces": names,
+            "points": points,
+            "forces": e.forces,
+            "torques": e.torques,
+        },
+        "residuals": {n: getattr(k.residuals, n) for n in _ResidualsFile.model_fields},
+        "method": k.method,
+        "iterations": k.iterations,
+        "cost_before": k.cost_before,
+        "cost_after": k.cost_after,
+        "status": k.status.name,
+    }
+
+
+def _with_assets(world: World, folder: Path) -> str:
+    """The world's MJCF; files that it names are copied beside it."""
+    if "file=" not in world.xml:
+        return world.xml
+    root = ElementTree.fromstring(world.xml)
+    base = world.robot.path.parent
+    dirs: dict[str, str] = {}
+    for compiler in root.iter("compiler"):
+        for key in ("assetdir", "meshdir", "texturedir"):
+            if key in compiler.attrib:
+                dirs[key] = compiler.attrib.pop(key)
+    names: dict[bytes, str] = {}
+    for element in root.iter():
+        for key, name in list(element.attrib.items()):
+            if not key.startswith("file") or element.tag == "compiler":
+                continue
+            kind = "texturedir" if element.tag == "texture" else "meshdir"
+            source = base / dirs.get(kind, dirs.get("assetdir", "")) / name
+            content = world.assets.get(name)
+            if content is None:
+                content = source.read_bytes()
+            if content not in names:
+                taken = set(names.values())
+                stem, suffix, n = Path(name).stem, Path(name).suffix, 2
+                unique = stem + suffix
+                while unique in taken:
+                    unique, n = f"{stem}-{n}{suffix}", n + 1
+                names[content] = unique
+            element.set(key, f"{ASSETS}/{names[content]}")
+    (folder / ASSETS).mkdir(exist_ok=True)
+    for content, name in names.items():
+        with _whole(folder / ASSETS / name) as stream:
+            stream.write(content)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def load_plan(folder: str | Path) -> Plan:
+    """Read what `save_plan` wrote, all but the paths.
+
+    The world is that of `scene.xml`: what a rollout is checked against.
+
+    Raises:
+        InputError: A file is missing, broken, or does not fit the others.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError("a run folder", source=folder)
+    path = folder / PLAN
+    file = _read_json(path, _PlanFile)
+    try:
+        options = pydantic.TypeAdapter(PlanOptions).validate_python(file.options)
+    except pydantic.ValidationError as e:
+        raise _misfit(e, path) from e
+    sequence = file.sequence.sequence(path)
+    world = _load_world(folder / SCENE, _robot(file.robot), sequence.scene)
+    nq = world.model.nq
+    for i, k in enumerate(file.keyframes):
+        if len(k.qpos) != nq:
+            raise InputError(
+                f"{nq} numbers, as many as {SCENE} has coordinates",
+                source=path,
+                field=f"keyframes.{i}.qpos",
+                value=f"{len(k.qpos)} numbers",
+            )
+        for c in k.contacts:
+            known = c.surface in world.surfaces and c.support in world.supports
+            if not known:
+                raise InputError(
+                    f"a surface of the robot on a support of {SCENE}",
+                    source=path,
+                    field=f"keyframes.{i}.contacts",
+                    value=f"{c.surface} on {c.support}",
+                )
+    trajectory = None
+    if (folder / TRAJECTORY).exists() or file.complete:
+        trajectory = load_trajectory(folder / TRAJECTORY, world)
+    timings: dict[str, float] = {}
+    if (folder / TIMINGS).exists():
+        timings = _read_json(folder / TIMINGS, _TimingsFile).seconds
+    return Plan(
+        world=world,
+        options=options,
+        sequence=sequence,
+        keyframes=tuple(k.keyframe() for k in file.keyframes),
+        paths=(),
+        skipped=tuple(Skipped(**s.model_dump()) for s in file.skipped),
+        trajectory=trajectory,
+        complete=file.complete,
+        timings=timings,
+    )
+
+
+def _robot(file: RobotFile) -> Robot:
+    return Robot(
+        name=file.name,
+        path=ROBOTS / file.model,
+        base=file.base,
+        home=file.home,
+        limbs={
+            n: Limb(
+                name=n,
+                root=x.root,
+                middle=x.middle,
+                end=x.end,
+                surfaces=tuple(x.surfaces),
+            )
+            for n in LIMBS
+            if (x := file.limbs.get(n))
+        },
+        prefixes=file.surfaces,
+        gains={n: (g.kp, g.kd, g.ki) for n, g in file.gains.items()},
+    )
+
+
+def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
+    try:
+        model = mujoco.MjSpec.from_file(str(path)).compile()
+        return clamber.model._index(model, path.read_text(), robot, scene)
+    except OSError as e:
+        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+    except (ValueError, KeyError, IndexError) as e:
+        reason = " ".join(str(e.args[0] if e.args else e).split())
+        raise InputError(
+            f"the robot and the boxes of {PLAN} as MJCF ({reason})", source=path
+        ) from e
+
+
+def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
+    """Write `trajectory.npz`."""
+    x = trajectory
+    _write_npz(
+        Path(path),
+        {
+            "time": x.time,
+            "qpos": x.q,
+            "qvel": x.v,
+            "joint_names": x.joints,
+            "surfaces": x.surfaces,
+            "contact": x.contact,
+            "tau": x.tau,
+            "keyframes": x.keyframes,
+        },
+    )
+
+
+def load_trajectory(path: str | Path, world: World) -> Trajectory:
+    """Read a `trajectory.npz` of that world.
+
+    Raises:
+        InputError: It is missing, broken or another robot's.
+    """
+    f = _Arrays(Path(path))
+    time = f.get("time", None)
+    n, m = len(time), world.model
+    joints = tuple(f.get("joint_names", len(world.joints)).tolist())
+    surfaces = tuple(f.get("surfaces", None).tolist())
+    for field, names, wanted in (
+        ("joint_names", joints, world.joints),
+        ("surfaces", surfaces, tuple(world.surfaces)),
+    ):
+        if names != wanted:
+            raise InputError(
+                f"those of {SCENE}, {', '.join(wanted)}",
+                source=f.path,
+                field=field,
+                value=", ".join(names),
+            )
+    return Trajectory(
+        time=time,
+        q=f.get("qpos", n, m.nq),
+        v=f.get("qvel", n, m.nv),
+        tau=f.get("tau", n, len(joints)),
+        contact=f.get("contact", n, len(surfaces)).astype(bool),
+        surfaces=surfaces,
+        joints=joints,
+        keyframes=f.get("keyframes", None),
+    )
+
+
+def save_timings(folder: str | Path, seconds: Mapping[str, float]) -> None:
+    """Add to the seconds by stage in `timings.json`."""
+    path = Path(folder) / TIMINGS
+    known: dict[str, float] = {}
+    if path.exists():
+        known = _read_json(path, _TimingsFile).seconds
+    _write_json(path, {"seconds": {**known, **seconds}})
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+# Rollouts and verdicts.
+
+
+def save_rollout(rollout: Rollout, folder: str | Path) -> None:
+    """Write `rollout.npz`: every field of the record by its name.
+
+    A dictionary of numbers becomes two arrays, the second one `<name>_keys`.
+    """
+    arrays: dict[str, Any] = {}
+    for field in fields(rollout):
+        value = getattr(rollout, field.name)
+        if isinstance(value, dict):
+            arrays[field.name] = np.array([*value.values()], dtype=float)
+            arrays[f"{field.name}_keys"] = np.array([*value], dtype=str)
+        else:
+            arrays[field.name] = value
+    _write_npz(Path(folder) / ROLLOUT, arrays)
+
+
+def load_rollout(folder: str | Path) -> Rollout:
+    """Read the `rollout.npz` of a run folder.
+
+    Raises:
+        InputError: It is missing or broken.
+    """
+    f = _Arrays(Path(folder) / ROLLOUT)
+    steps, states = len(f.get("ctrl", None, None)), len(f.get("time", None))
+    nu, ns = f.get("ctrl", None, None).shape[1], len(f.get("surfaces", None))
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "ctrl": (steps, nu),
+        "qpos": (states, None),
+        "qvel": (states, None),
+        "actuator_force": (states, nu),
+        "contact_force": (states, ns, 3),
+        "unintended": (states,),
+    }
+    values: dict[str, Any] = {}
+    for name, kind in get_type_hints(Rollout).items():
+        if kind is np.ndarray:
+            shape = shapes.get(name, (states,))
+            values[name] = f.get(name, *shape)
+        elif kind is Any or get_args(kind):
+            x = f.get(name, None).tolist()
+            is_dict = get_args(kind)[-1] is float
+            values[name] = (
+                dict(zip(f.get(f"{name}_keys", len(x)).tolist(), x, strict=True))
+                if is_dict
+                else tuple(x)
+            )
+        else:
+            values[name] = kind(f.get(name).item())
+    return Rollout(**values)
+
+
+class _CriterionFile(pydantic.BaseModel):
+    value: float | None
+    limit: float
+    ok: bool
+
+
+class _VerdictFile(pydantic.BaseModel):
+    reached: bool
+    criteria: dict[str, _CriterionFile]
+
+
+def save_verdict(verdict: Verdict, folder: str | Path) -> None:
+    """Write `verdict.json`."""
+    _write_json(Path(folder) / VERDICT, verdict_fields(verdict))
+
+
+def verdict_fields(verdict: Verdict) -> dict[str, Any]:
+    """A verdict by the keys of `verdict.json`."""
+    return {
+        "reached": verdict.reached,
+        "criteria": {n: asdict(c) for n, c in verdict.criteria.items()},
+    }
+
+
+def load_verdict(folder: str | Path) -> Verdict:
+    """Read the `verdict.json` of a run folder.
+
+    Raises:
+        InputError: It is missing or broken.
+    """
+    file = _read_json(Path(folder) / VERDICT, _VerdictFile)
+    return Verdict(
+        reached=file.reached,
+        criteria={
+            n: Criterion(
+                value=math.nan if c.value is None else c.value, limit=c.limit, ok=c.ok
+            )
+            for n, c in file.criteria.items()
+        },
+    )
