@@ -19,9 +19,9 @@ import os
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import IO, Any, Literal, TypeVar, get_args, get_type_hints
+from typing import IO, Any, TypeVar, get_args, get_type_hints
 from xml.etree import ElementTree
 
 import mujoco
@@ -216,8 +216,9 @@ def _misfit(error: pydantic.ValidationError, path: Path) -> InputError:
 
 
 def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    content: dict[str, Any] = {k: np.asarray(v) for k, v in arrays.items()}
     with _whole(path) as stream:
-        np.savez_compressed(stream, **{k: np.asarray(v) for k, v in arrays.items()})
+        np.savez_compressed(stream, **content)
 
 
 class _Arrays:
@@ -276,7 +277,7 @@ class _SceneFile(pydantic.BaseModel):
             Box(
                 name=b.name,
                 size=np.array(b.size),
-                position=np.array(b.position) + [0.0, 0.0, b.size[2] / 2],
+                position=np.array(b.position) + np.array([0.0, 0.0, b.size[2] / 2]),
                 rotation=matrix_from_rpy(b.rpy),
                 friction=b.friction,
             )
@@ -554,8 +555,8 @@ class _TimingsFile(pydantic.BaseModel):
 def save_plan(plan: Plan, folder: str | Path) -> None:
     """Write `plan.json`, `trajectory.npz`, `scene.xml` with assets and `timings.json`.
 
-    Results that the folder holds of an earlier plan are removed. `plan.json` comes last:
-    where it is, the others are.
+    Results that the folder holds of an earlier plan are removed. `plan.json` comes
+    last: where it is, the others are.
     """
     folder = Path(folder)
     for name in (PLAN, *_OF_AN_EARLIER_PLAN):
@@ -781,7 +782,11 @@ def _robot(file: RobotFile) -> Robot:
 def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
     try:
         model = mujoco.MjSpec.from_file(str(path)).compile()
-        return clamber.model._index(model, path.read_text(), robot, scene)
+        world = clamber.model._index(model, path.read_text(), robot, scene)
+        for limb in robot.limbs.values():
+            for name in (limb.root, limb.middle, limb.end):
+                world.landmark(name)
+        return world
     except OSError as e:
         raise InputError(f"a readable file ({e.strerror})", source=path) from e
     except (ValueError, KeyError, IndexError) as e:
