@@ -478,6 +478,10 @@ def test_a_broken_trajectory_is_named(plan: Plan, saved: Path, tmp_path: Path):
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"trajectory\.npz expected a whole \.npz"):
             io.load_trajectory(path, plan.world)
+    with path.open("wb") as stream:
+        np.save(stream, np.zeros(3))
+    with pytest.raises(InputError, match="expected a whole"):
+        io.load_trajectory(path, plan.world)
     with np.load(saved / "trajectory.npz") as f:
         arrays = dict(f)
     np.savez(path, **{**arrays, "qpos": arrays["qpos"][:, 1:]})

@@ -59,6 +59,7 @@ _UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
     NotImplementedError,
+    TypeError,  # a single array, which is no context
 )
 _Model = TypeVar("_Model", bound=pydantic.BaseModel)
 _Record = TypeVar("_Record")
@@ -227,7 +228,7 @@ class _Arrays:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            with np.load(path, allow_pickle=False) as f:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as f:
                 self._arrays = {k: f[k] for k in f.files}
         except _UNREADABLE as e:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else e
