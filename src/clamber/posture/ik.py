@@ -41,7 +41,7 @@ CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
-EDGE_INSET = 0.005  # [m] contacts stay this far inside the support's border
+EDGE_INSET = .015  # [m] contacts stay this far inside the support's border
 SOFT, EQUALITY = 8, 5  # daqp's constraint types
 
 
@@ -467,6 +467,9 @@ class IK:
             k = self._hard.take(m)
             self._hard.J[k.start : k.start + 3] = jac
             self._hard.lo[k.start : k.start + 3] = target - p
+            if s.radius > 0 and g.link is not None:
+                centre = kin.point_jacobian(s.body, p + s.radius * n)
+                self._inside(*self._edges[g.support], p, centre)
             if s.is_flat:
                 turn = kin.flat_error(g.surface, g.rotation)
                 self._violation += _size(turn)
