@@ -106,7 +106,7 @@ class _Tracks:
 
     def valid(self, *names: str) -> np.ndarray:
         """(T,) whether all these points are seen."""
-        return self.demo.valid[:, [self.demo.names.index(n) for n in names]].all(axis=1)
+        return _all(self.demo.valid[:, [self.demo.names.index(n) for n in names]].T)
 
 
 def detect_contacts(
@@ -148,9 +148,9 @@ def detect_contacts(
     found.sort(key=lambda i: (i.t0, i.part))
     t, stances = _stances(tracks, found, options)
     seated = [
-        _interval(tracks, SEAT, "Pelvis", s, *span, demo.t[list(span)], "LHip")
-        for s, _, spans in seats
-        for span in spans
+        _interval(tracks, SEAT, "Pelvis", support, i, j, demo.t[[i, j]])
+        for support, _, spans in seats
+        for i, j in spans
     ]
     return ContactSequence(
         source=demo.source,
@@ -160,6 +160,16 @@ def detect_contacts(
         t=t,
         intervals=tuple(sorted([*found, *seated], key=lambda i: (i.t0, i.part))),
     )
+
+
+def _any(rows: np.ndarray) -> np.ndarray:
+    """(T,) whether any of the rows (N, T) is true."""
+    return np.logical_or.reduce(rows, axis=0)
+
+
+def _all(rows: np.ndarray) -> np.ndarray:
+    """(T,) whether all of the rows (N, T) are true."""
+    return np.logical_and.reduce(rows, axis=0)
 
 
 def _samples(seconds: float, rate: float) -> int:
@@ -175,10 +185,11 @@ def _smooth(demo: Demonstration, options: DetectOptions) -> _Tracks:
         raise InputError("five samples at least", source=demo.source, value=longest)
     n = min(_samples(options.smoothing, demo.rate), longest)
     short = min(_samples(options.smoothing / 2, demo.rate), longest)
-    velocity = savgol_filter(demo.position, n, 2, deriv=1, delta=1 / demo.rate, axis=0)
+    p, dt = demo.position, 1.0 / demo.rate
+    velocity = np.asarray(savgol_filter(p, n, 2, deriv=1, delta=dt, axis=0))
     return _Tracks(
         demo=demo,
-        position=savgol_filter(demo.position, short, 2, axis=0),
+        position=np.asarray(savgol_filter(p, short, 2, axis=0)),
         speed=np.linalg.norm(velocity, axis=2),
     )
 
@@ -282,8 +293,17 @@ def _find_seats(tracks: _Tracks, scene: Scene, options: DetectOptions) -> list:
 def _hysteresis(
     strict: np.ndarray, loose: np.ndarray, shortest: float
 ) -> list[tuple[int, int]]:
-    """Ranges [i, j) of `loose`, long enough, that are `strict` somewhere."""
-    return [(i, j) for i, j in runs(loose) if j - i >= shortest and np.any(strict[i:j])]
+    """Ranges [i, j), long enough, from `strict` until no longer `loose`.
+
+    What is `loose` from the very beginning of the recording began out of sight.
+    """
+    out = []
+    for i, j in runs(loose):
+        if np.any(strict[i:j]):
+            first = i + int(np.argmax(strict[i:j])) if i > 0 else i
+            if j - first >= shortest:
+                out.append((first, j))
+    return out
 
 
 def _calibrate(
@@ -331,13 +351,11 @@ def _part_intervals(
             loose[row] &= (n.height > w.low - slack) & (n.height < w.high + slack)
             strict[row] = loose[row] & (speed < options.enter_speed)
             strict[row] &= (n.height > w.low) & (n.height < w.high)
-        either = _join(tracks, part, loose.any(axis=0), options)
-        for i, j in _hysteresis(
-            strict.any(axis=0), either, options.min_duration * demo.rate
-        ):
+        either = _join(tracks, part, _any(loose), options)
+        for i, j in _hysteresis(_any(strict), either, options.min_duration * demo.rate):
             some = round(options.smoothing * demo.rate)
             firsts, lasts = (
-                [p for p, ok in zip(points, loose[:, m].any(axis=1), strict=True) if ok]
+                [p for p, ok in zip(points, _any(loose[:, m].T), strict=True) if ok]
                 for m in (slice(i, min(i + some, j)), slice(max(j - some, i), j))
             )
             t0, t1 = float(demo.t[0]), float(demo.t[-1])
@@ -349,10 +367,8 @@ def _part_intervals(
                 t1 = max(_refine(tracks, p, support, i, j, leaving=True) for p in lasts)
             if t1 - t0 < options.min_duration:
                 continue
-            base, tip = _limb_ends(demo, part)
-            yield _interval(
-                tracks, part, part, support, i, j - 1, np.array([t0, t1]), base, tip
-            )
+            ends, t = _limb_ends(demo, part), np.array([t0, t1])
+            yield _interval(tracks, part, part, support, i, j - 1, t, ends)
 
 
 def _apart(intervals: Iterable[ContactInterval]) -> list[ContactInterval]:
@@ -428,7 +444,7 @@ def _noise(x: np.ndarray) -> float:
 
 def _fit_instant(p: np.ndarray, k: int, half: int) -> int:
     """Index within `half` of k at which rest begins, by least squares."""
-    low, high = max(k - 2 * half, 0), min(k + 2 * half + 1, len(p))
+    low, high = max(k - 2 * half, 0), min(k + 4 * half + 1, len(p))
     y, s = p[low:high], np.arange(low, high)
     best = (np.inf, k)
     for c in range(max(k - half, low + 3), min(k + half, high - 4) + 1):
@@ -461,13 +477,12 @@ def _interval(
     i: int,
     j: int,
     t: np.ndarray,
-    base: str,
-    tip: str | None = None,
+    ends: tuple[str, str] | None = None,
 ) -> ContactInterval:
     """A contact with the pose it has over samples i to j, both included.
 
     The place is the median of the part's reference point, on the support; the heading
-    is that from `base` to `tip`. Without a tip, it is the way the hips face.
+    is that from the first to the second of `ends`; without, the way the hips face.
     """
     ok = np.zeros(len(tracks.demo.t), dtype=bool)
     ok[i : j + 1] = True
@@ -478,11 +493,11 @@ def _interval(
     A, b = support.edges()
     for row, limit in zip(A, b, strict=True):  # a wrist may hang over the edge
         p = p - row * max(float(row @ p - limit), 0.0)
-    if tip is None:
+    if ends is None:
         left = np.mean((tracks.at("LHip") - tracks.at("RHip"))[ok], axis=0)
         heading = np.array([left[1], -left[0], 0.0])
     else:
-        heading = np.mean((tracks.at(tip) - tracks.at(base))[ok], axis=0)
+        heading = np.mean((tracks.at(ends[1]) - tracks.at(ends[0]))[ok], axis=0)
     contact = Contact(
         surface=part,
         support=support.name,

@@ -1,0 +1,324 @@
+"""Contacts are found again in recordings whose true contacts are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import yaml
+
+from clamber.contact import DIRECTIONS, ContactInterval, ContactSequence
+from clamber.demo import ClimbOptions, Demonstration, load_demo, synthesize_climb
+from clamber.detect import (
+    SEAT,
+    DetectOptions,
+    _fit_instant,
+    _hysteresis,
+    _noise,
+    detect_contacts,
+)
+from clamber.errors import InputError
+from clamber.scene import GROUND, Scene
+from clamber.se3 import matrix_from_quat
+
+ORDER = ("LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee")
+
+
+def climb(seed: int = 0, **options) -> tuple[Demonstration, list[ContactInterval]]:
+    rng = np.random.default_rng(seed)
+    return synthesize_climb(rng, options=ClimbOptions(**options))
+
+
+def errors(sequence: ContactSequence, truth: list[ContactInterval]) -> np.ndarray:
+    """(N, 2) errors of start and end [s]; fails unless the very same contacts exist."""
+    found = {(i.part, i.contact.support): i for i in sequence.intervals}
+    true = {(i.part, i.contact.support): i for i in truth}
+    assert len(found) == len(sequence.intervals)
+    assert set(found) == set(true)
+    return np.array([[found[k].t0 - i.t0, found[k].t1 - i.t1] for k, i in true.items()])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("noise", [0.0, 0.002, 0.005])
+def test_true_contacts_and_no_others_are_found_within_50_ms(noise, seed):
+    demo, truth = climb(seed, noise=noise)
+    assert np.abs(errors(detect_contacts(demo), truth)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"height_ratio": 0.57},
+        {"height_ratio": 0.75},
+        {"height_ratio": 1.12},
+        {"mirrored": True, "noise": 0.005},
+        {"speed": 2.0, "noise": 0.005},
+        {"speed": 1.4},
+        {"gaps": 25},
+        {"rate": 60.0},
+        {"rate": 240.0},
+        {"knee": (0.2, 0.14), "elbow_side": 0.27},
+    ],
+    ids=str,
+)
+def test_detection_holds_for_other_heights_orders_speeds_and_rates(options):
+    demo, truth = climb(5, **options)
+    assert np.abs(errors(detect_contacts(demo), truth)).max() < 0.05
+
+
+def test_a_slow_climb_is_found_though_its_landings_are_gentle():
+    demo, truth = climb(1, speed=0.5)
+    assert np.abs(errors(detect_contacts(demo), truth)).max() < 0.1
+
+
+def test_places_and_headings_are_those_of_the_contact():
+    demo, truth = climb()
+    true = {i.part: i.contact for i in truth}
+    for i in detect_contacts(demo).intervals:
+        there = true[i.part]
+        np.testing.assert_allclose(i.contact.position, there.position, atol=5e-3)
+        R, R_true = (
+            matrix_from_quat(i.contact.quaternion),
+            matrix_from_quat(there.quaternion),
+        )
+        np.testing.assert_allclose(R[:, 2], [0, 0, 1], atol=1e-9)
+        if not i.part.endswith("Hand"):  # a hand's heading follows the forearm
+            assert R[:, 0] @ R_true[:, 0] > np.cos(0.15)
+
+
+def test_stances_show_the_climb_in_order():
+    demo, _ = climb()
+    sequence = detect_contacts(demo)
+    regions = "".join(s.region for s in sequence.stances)
+    assert regions == "GMMMMMMOO"
+    made, before = [], set()
+    for stance in sequence.stances:
+        made += [x for x in stance.surfaces if x not in before]
+        before = set(stance.surfaces)
+    assert made == ["LFoot", "RFoot", *ORDER]
+    assert set(sequence.stances[-1].surfaces) == set(ORDER)
+    assert sequence.subject is not None
+    assert sequence.subject["forearm"] == pytest.approx(0.254, abs=2e-3)
+
+
+def test_a_contact_that_goes_on_keeps_its_pose_over_stances():
+    demo, _ = climb()
+    stances = detect_contacts(demo).stances
+    for a, b in pairwise(stances):
+        for contact in a.contacts:
+            later = b.contact(contact.surface)
+            assert later is None or later is contact
+
+
+def test_posture_directions_are_the_recorded_ones():
+    demo, _ = climb(noise=0.0, gaps=0)
+    first = detect_contacts(demo).stances[0]
+    assert set(first.posture) == set(DIRECTIONS)
+    for direction in first.posture.values():
+        assert np.linalg.norm(direction) == pytest.approx(1.0)
+    assert first.posture["trunk"] @ [0, 0, 1] > 0.95
+    k = np.searchsorted(demo.t, 20.0)
+    shank = demo.point("LFoot")[k] - demo.point("LKnee")[k]
+    last = detect_contacts(demo).stances[-1].posture["left_shank"]
+    np.testing.assert_allclose(last, shank / np.linalg.norm(shank), atol=1e-6)
+
+
+def test_detection_does_not_depend_on_where_the_world_lies():
+    demo, _ = climb(noise=0.0, gaps=0)
+    angle, shift = 0.7, np.array([3.0, -2.0, 0.0])
+    R = np.array(
+        [
+            [np.cos(angle), -np.sin(angle), 0],
+            [np.sin(angle), np.cos(angle), 0],
+            [0, 0, 1],
+        ]
+    )
+    box = demo.scene.boxes[0]
+    there = replace(box, position=R @ box.position + shift, rotation=R @ box.rotation)
+    scene = Scene(boxes=(there,), start=np.array([3.0, -2.0, angle]))
+    moved = replace(demo, position=demo.position @ R.T + shift, scene=scene)
+    for a, b in zip(
+        detect_contacts(demo).intervals, detect_contacts(moved).intervals, strict=True
+    ):
+        assert a.part == b.part
+        assert (a.t0, a.t1) == pytest.approx((b.t0, b.t1), abs=1e-9)
+        np.testing.assert_allclose(
+            R @ a.contact.position + shift, b.contact.position, atol=1e-9
+        )
+
+
+def test_without_the_box_nothing_touches_it():
+    demo, _ = climb()
+    bare = detect_contacts(demo, scene=Scene(boxes=(), start=np.zeros(3)))
+    assert {(i.part, i.contact.support) for i in bare.intervals} == {
+        ("LFoot", GROUND),
+        ("RFoot", GROUND),
+    }
+
+
+def test_a_part_out_of_sight_is_not_said_to_be_in_contact():
+    demo, _ = climb(noise=0.0, gaps=0)
+    valid = demo.valid.copy()
+    blind = (demo.t > 15.0) & (demo.t < 17.0)
+    valid[blind, demo.names.index("LElbow")] = False
+    spans = [
+        (i.t0, i.t1)
+        for i in detect_contacts(replace(demo, valid=valid)).intervals
+        if i.part == "LElbow"
+    ]
+    assert len(spans) == 2
+    assert spans[0][1] == pytest.approx(15.0, abs=0.02)
+    assert spans[1][0] == pytest.approx(17.0, abs=0.02)
+
+
+def seated(demo: Demonstration) -> Demonstration:
+    """The person sitting on the near edge, shanks hanging down in front of it."""
+    box = demo.scene.boxes[0]
+    edge, h = box.position[0] - box.size[0] / 2, box.size[2]
+    place = {
+        "Pelvis": (0.35, 0.0, 0.10), "Hip": (0.35, 0.10, 0.10),
+        "Knee": (0.02, 0.10, 0.08), "Foot": (0.0, 0.10, 0.08 - 0.453),
+        "Foot.toe": (-0.14, 0.10, 0.03 - 0.453), "Shoulder": (0.35, 0.16, 0.63),
+        "Elbow": (0.33, 0.20, 0.35), "Hand": (0.20, 0.18, 0.25),
+        "Hand.knuckle": (0.12, 0.18, 0.25), "Hand.tip": (0.05, 0.18, 0.25),
+        "Neck": (0.35, 0.0, 0.7), "Head": (0.35, 0.0, 0.85),
+    }  # fmt: skip
+    still = np.zeros((len(demo.t), len(demo.names), 3))
+    for f, name in enumerate(demo.names):
+        sided = name[0] in "LR"
+        x, y, z = place[name[1:] if sided else name]
+        still[:, f] = [edge + x, -y if name[0] == "R" else y, h + z]
+    return replace(demo, position=still)
+
+
+def test_sitting_is_a_seat_and_never_a_contact_of_the_knees():
+    demo = seated(climb(noise=0.0, gaps=0, height_ratio=1.12)[0])
+    with pytest.raises(InputError, match="at least one contact"):
+        detect_contacts(demo)  # a seat alone makes no stance
+    hand = demo.position.copy()
+    for f, name in enumerate(demo.names):
+        if name.startswith("LHand"):
+            hand[:, f, 2] = demo.scene.boxes[0].size[2] + 0.02
+    sequence = detect_contacts(replace(demo, position=hand))
+    kinds = {(i.part, i.is_surface) for i in sequence.intervals}
+    assert kinds == {("LHand", True), (SEAT, False)}
+    assert sequence.stances[0].surfaces == ("LHand",)
+
+
+def test_a_standing_knee_over_a_low_box_does_not_kneel():
+    demo, _ = climb(noise=0.0, gaps=0)
+    h = demo.point("LKnee")[0, 2] - 0.08  # just under the knee of the standing person
+    boxes = (replace(demo.scene.boxes[0], size=np.array([3, 3, h])),)
+    boxes = (replace(boxes[0], position=np.array([1.45, 0, h / 2])),)
+    still = replace(demo, position=np.repeat(demo.position[:1], len(demo.t), axis=0))
+    found = detect_contacts(still, scene=Scene(boxes=boxes, start=np.zeros(3)))
+    assert not [i for i in found.intervals if i.part.endswith("Knee")]
+
+
+def test_a_hand_that_rests_in_the_air_touches_nothing():
+    demo, _ = climb(noise=0.0, gaps=0)
+    p = demo.position.copy()
+    for f, name in enumerate(demo.names):
+        if name.startswith("LHand"):
+            p[:, f, 2] += 0.12
+    found = detect_contacts(replace(demo, position=p))
+    assert "LHand" not in {i.part for i in found.intervals}
+
+
+def test_changes_closer_than_merge_are_one_change_of_stance():
+    demo, _ = climb()
+    apart = detect_contacts(demo)
+    together = detect_contacts(demo, options=DetectOptions(merge=2.5))
+    assert len(together.stances) < len(apart.stances)
+    assert [(i.part, i.t0) for i in together.intervals] == [
+        (i.part, i.t0) for i in apart.intervals
+    ]
+
+
+def test_hysteresis_begins_strict_and_lasts_while_loose():
+    loose = np.array([1, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 0, 1, 1], dtype=bool)
+    strict = np.array([0, 1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 0, 1, 0], dtype=bool)
+    assert _hysteresis(strict, loose, 2) == [(0, 2), (4, 8), (12, 14)]
+    assert _hysteresis(strict, loose, 3) == [(4, 8)]
+
+
+def test_noise_is_measured_on_a_moving_track(rng):
+    t = np.linspace(0, 10, 1200)[:, None]
+    track = np.sin(t * [1.0, 2.0, 0.5]) + 0.004 * rng.standard_normal((1200, 3))
+    assert _noise(track) == pytest.approx(0.004, rel=0.1)
+
+
+@pytest.mark.parametrize("true", [45, 52, 58])
+def test_the_instant_of_touching_is_fitted_through_noise(rng, true):
+    s = np.arange(100)
+    p = np.maximum(true - s, 0)[:, None] / 120 * [0.1, 0.0, 0.35]
+    p = p + 0.002 * rng.standard_normal((100, 3))
+    assert abs(_fit_instant(p, 50, 12) - true) <= 2
+
+
+def recording(shared, folder, tmp_path, **fields):
+    at = shared / "demos"
+    said = {
+        "file": str(at / folder / "joints.npy"),
+        "names": str(at / "joint_names.json"),
+        "boxes": str(at / folder / "boxes.obj"),
+        "rate": 120,
+        **fields,
+    }
+    path = tmp_path / "recording.yaml"
+    path.write_text(yaml.safe_dump(said))
+    return detect_contacts(load_demo(path))
+
+
+def first_on(sequence: ContactSequence, box: str) -> list[tuple[str, float]]:
+    """Parts in the order in which they first touch a box, with the times."""
+    seen: dict[str, float] = {}
+    for i in sequence.intervals:
+        if i.contact.support == box and i.is_surface:
+            seen.setdefault(i.part, i.t0)
+    return list(seen.items())
+
+
+CLIMB_0 = {"Hand": 5.5, "RKnee": 6.9, "LKnee": 8.1, "RFoot": 9.9, "LFoot": 10.6}
+CLIMB_1 = {"Hand": 2.65, "RKnee": 4.4, "LKnee": 5.4, "RFoot": 6.6, "LFoot": 7.5}
+
+
+@pytest.mark.parametrize(
+    ("folder", "fields", "expected"),
+    [
+        ("climb-0", {}, CLIMB_0),
+        ("climb-0", {"ground": "box2", "span": [3.5, 11.0]}, CLIMB_0),
+        ("climb-1", {}, CLIMB_1),
+    ],
+)
+def test_a_real_climb_is_read_as_people_read_it(
+    shared, tmp_path, folder, fields, expected
+):
+    order = first_on(recording(shared, folder, tmp_path, **fields), "box1")
+    assert {p for p, _ in order[:2]} == {"LHand", "RHand"}
+    assert [p for p, _ in order[2:]] == ["RKnee", "LKnee", "RFoot", "LFoot"]
+    for part, t in order:
+        assert t == pytest.approx(expected.get(part, expected["Hand"]), abs=0.2), part
+
+
+def test_a_real_person_who_sits_down_is_seated_and_does_not_kneel(shared, tmp_path):
+    sequence = recording(shared, "climb-0", tmp_path)
+    seats = [i for i in sequence.intervals if not i.is_surface]
+    assert [i.part for i in seats] == [SEAT]
+    assert seats[0].t0 == pytest.approx(16.05, abs=0.3)
+    assert seats[0].t1 == pytest.approx(18.5, abs=0.3)
+    late = [i.part for i in sequence.intervals if i.t0 > 11.0]
+    assert not [p for p in late if p.endswith(("Knee", "Elbow"))]
+
+
+def test_a_real_climb_ends_on_hands_and_knees_and_the_feet_leave_in_order(
+    shared, tmp_path
+):
+    sequence = recording(shared, "climb-0", tmp_path, ground="box2", span=[3.5, 8.45])
+    assert set(sequence.stances[-1].surfaces) == {"LHand", "RHand", "LKnee", "RKnee"}
+    assert sequence.stances[0].region == "G"
+    leaves = {i.part: i.t1 for i in sequence.intervals if i.contact.support == GROUND}
+    assert leaves["RFoot"] == pytest.approx(6.04, abs=0.2)
+    assert leaves["LFoot"] == pytest.approx(7.43, abs=0.2)
