@@ -1,7 +1,7 @@
 """Trajectory -> joint commands.
 
-Every joint has a servo, tau = kp (u - q) - kd qdot, saturated at its effort limit by the
-physics. The PID law with feed-forward
+Every joint has a servo, tau = kp (u - q) - kd qdot, saturated at its effort limit by
+the physics. The PID law with feed-forward
 
     tau = kp (q_ref - q) + kd (qdot_ref - qdot) + ki int(q_ref - q) dt + tau_ff
 
@@ -30,9 +30,10 @@ class PID:
         self._kp = world.kp
         damping = world.kd + world.model.dof_damping[world.dadr]
         self._reference = trajectory.q[:, world.qadr]
-        self._feedforward = self._reference + (
-            damping * trajectory.v[:, world.dadr] + trajectory.tau
-        ) / world.kp
+        self._feedforward = (
+            self._reference
+            + (damping * trajectory.v[:, world.dadr] + trajectory.tau) / world.kp
+        )
         self._integral = np.zeros(len(world.kp))
 
     def command(self, k: int, q: np.ndarray) -> np.ndarray:

@@ -32,6 +32,7 @@ class InputError(ClamberError):
         field: str | None = None,
         value: object = None,
     ) -> None:
+        """Compose the sentence."""
         self.expected, self.source, self.field, self.value = (
             expected,
             source,
@@ -48,6 +49,7 @@ class Infeasible(ClamberError):
     """A problem has no solution; `result` holds the best that was found."""
 
     def __init__(self, message: str, result: object = None) -> None:
+        """Keep the best that was found."""
         self.result = result
         super().__init__(message)
 
@@ -56,6 +58,7 @@ class MissingDependency(ClamberError):
     """An optional package is absent."""
 
     def __init__(self, package: str, extra: str) -> None:
+        """Name the package and the extra that brings it."""
         self.package = package
         super().__init__(
             f"{package} is not installed: pip install 'clamber[{extra}]' brings it"

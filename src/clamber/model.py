@@ -1,9 +1,9 @@
 """Robot and world: one MuJoCo model serves planning and physics.
 
 A `Robot` is a description (MJCF or URDF) with what a planner must know beyond it: which
-geoms are surfaces, which chain is a limb, where it stands at the start. `World` is robot
-and scene compiled together; `Kinematics` is a configuration of it for which forward
-kinematics have been run.
+geoms are surfaces, which chain is a limb, where it stands at the start. `World` is
+robot and scene compiled together; `Kinematics` is a configuration of it for which
+forward kinematics have been run.
 
 Shapes: nq, nv of the world's model; na actuated joints; the first 7 of `q` and 6 of `v`
 are the floating base.
@@ -11,7 +11,7 @@ are the floating base.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -49,9 +49,9 @@ class LimbFile(_Strict):
 class GainsFile(_Strict):
     """Joint gains: [N m/rad], [N m s/rad], [N m/(rad s)]."""
 
-    kp: float = pydantic.Field(600.0, gt=0)
-    kd: float = pydantic.Field(20.0, ge=0)
-    ki: float = pydantic.Field(9.0, ge=0)
+    kp: float = pydantic.Field(default=600.0, gt=0)
+    kd: float = pydantic.Field(default=20.0, ge=0)
+    ki: float = pydantic.Field(default=9.0, ge=0)
 
 
 class RobotFile(_Strict):
@@ -145,12 +145,18 @@ def load_robot(name_or_path: str | Path) -> Robot:
         raise input_error(e, path) from e
     missing = set(LIMBS) - set(file.limbs)
     if missing:
-        raise InputError("all four limbs", source=path, field="limbs", value=sorted(missing))
+        raise InputError(
+            "all four limbs", source=path, field="limbs", value=sorted(missing)
+        )
     model_path = path.parent / file.model
     if not model_path.is_file():
-        raise InputError("an MJCF or URDF file", source=path, field="model", value=file.model)
+        raise InputError(
+            "an MJCF or URDF file", source=path, field="model", value=file.model
+        )
     limbs = {
-        n: Limb(name=n, root=f.root, middle=f.middle, end=f.end, surfaces=tuple(f.surfaces))
+        n: Limb(
+            name=n, root=f.root, middle=f.middle, end=f.end, surfaces=tuple(f.surfaces)
+        )
         for n in LIMBS
         for f in (file.limbs[n],)
     }
@@ -161,7 +167,9 @@ def load_robot(name_or_path: str | Path) -> Robot:
         base=file.base,
         home=dict(file.home),
         limbs=limbs,
-        prefixes={s: file.surfaces.get(s, s) for limb in limbs.values() for s in limb.surfaces},
+        prefixes={
+            s: file.surfaces.get(s, s) for limb in limbs.values() for s in limb.surfaces
+        },
         gains={n: (g.kp, g.kd, g.ki) for n, g in gains.items()},
     )
     _check(robot, path)
@@ -178,10 +186,17 @@ def _check(robot: Robot, source: Path) -> None:
     geoms = {model.geom(i).name for i in range(model.ngeom)}
     joints = {model.joint(i).name for i in range(model.njnt)}
     if robot.base not in bodies:
-        raise InputError(f"a body of {robot.path.name}", source=source, field="base", value=robot.base)
+        raise InputError(
+            f"a body of {robot.path.name}",
+            source=source,
+            field="base",
+            value=robot.base,
+        )
     for name in robot.home:
         if name not in joints:
-            raise InputError(f"a joint of {robot.path.name}", source=source, field="home", value=name)
+            raise InputError(
+                f"a joint of {robot.path.name}", source=source, field="home", value=name
+            )
     for limb in robot.limbs.values():
         for field in ("root", "middle", "end"):
             if getattr(limb, field) not in bodies | geoms:
@@ -194,7 +209,8 @@ def _check(robot: Robot, source: Path) -> None:
         for s in limb.surfaces:
             if not any(_bears(g, robot.prefixes[s]) for g in geoms):
                 raise InputError(
-                    f"geoms of {robot.path.name} named {robot.prefixes[s]!r} or {robot.prefixes[s] + '_...'!r}",
+                    f"a surface that geoms of {robot.path.name} bear by the prefix"
+                    f" {robot.prefixes[s]!r}",
                     source=source,
                     field=f"limbs.{limb.name}.surfaces",
                     value=s,
@@ -216,7 +232,8 @@ class Surface:
         radius: Radius of the ball; 0 for a flat surface.
         rotation: (3, 3) R_BC of a flat surface in contact: z into the link, x along its
             length; None for a point surface.
-        corners: (K, 3) points that can bear force (K = 1 or 4), ball centres or corners.
+        corners: (K, 3) points that can bear force (K = 1 or 4), ball centres or
+        corners.
     """
 
     name: str
@@ -316,7 +333,7 @@ def build_world(robot: Robot, scene: Scene) -> World:
 
 
 def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Free joint at the pelvis, servos on the hinges, surfaces' geoms by their names."""
+    """Free joint at the pelvis, servos on the hinges, geoms by surfaces' names."""
     for a in list(spec.actuators):
         spec.delete(a)
     for k in list(spec.keys):
@@ -356,7 +373,9 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
         rgb1=[0.86, 0.87, 0.88],
         rgb2=[0.80, 0.81, 0.83],
     )
-    material = spec.add_material(name="clamber_ground", texrepeat=[2, 2], texuniform=True)
+    material = spec.add_material(
+        name="clamber_ground", texrepeat=[2, 2], texuniform=True
+    )
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "clamber_ground"
     spec.add_texture(
         name="clamber_sky",
@@ -368,7 +387,9 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
         rgb2=[0.75, 0.80, 0.86],
     )
     world = spec.worldbody
-    light = world.add_light(pos=[-1.0, -2.0, 4.0], dir=[0.35, 0.5, -1.0], castshadow=True)
+    light = world.add_light(
+        pos=[-1.0, -2.0, 4.0], dir=[0.35, 0.5, -1.0], castshadow=True
+    )
     light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     light.diffuse = [0.6, 0.6, 0.6]
     common = {"priority": 1, "solref": [*SOLREF], "condim": 4}
@@ -398,7 +419,9 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
 def _index(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World:
     """Look everything up once."""
     base = model.body(robot.base).id
-    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    hinges = [
+        j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
     qadr, dadr = model.jnt_qposadr[hinges].copy(), model.jnt_dofadr[hinges].copy()
     q_min, q_max = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for j in hinges:
@@ -449,15 +472,19 @@ def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
     """Contact geometry from the geoms that bear the surface's name.
 
     The geom with the bare name (else the first) is the one that plans: a sphere is a
-    point surface, a capsule one at its lower end, a box or any other a flat surface, its
-    face the one that looks down at home.
+    point surface, a capsule one at its lower end, a box or any other a flat surface,
+    its face the one that looks down at home.
     """
     geoms = [g for g in range(model.ngeom) if _bears(model.geom(g).name, name)]
     main = next((g for g in geoms if model.geom(g).name == name), geoms[0])
     body = int(model.geom_bodyid[main])
     bodies = {int(model.geom_bodyid[g]) for g in geoms}
     if len(bodies) > 1:
-        raise InputError("one body for each surface", field=name, value=sorted(model.body(b).name for b in bodies))
+        raise InputError(
+            "one body for each surface",
+            field=name,
+            value=sorted(model.body(b).name for b in bodies),
+        )
     kind, size = mujoco.mjtGeom(int(model.geom_type[main])), model.geom_size[main]
     p_BG, R_BG = model.geom_pos[main].copy(), matrix_from_quat(model.geom_quat[main])
     R_WB = data.xmat[body].reshape(3, 3)
@@ -515,7 +542,7 @@ def _stand(
     home: np.ndarray,
     surfaces: Mapping[str, Surface],
 ) -> np.ndarray:
-    """Move the base so that the ankles' midpoint is at the start and the soles at z = 0."""
+    """Put the ankles' midpoint at the start and the soles on the ground."""
     ends = [robot.limbs[n].end for n in ("left_leg", "right_leg")]
     low, ankles = np.inf, []
     for name in ends:
@@ -553,7 +580,10 @@ def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
             if not masks or wa == wb:
                 continue
             if robot[a] and robot[b]:
-                parents = (model.body_weldid[model.body_parentid[wa]], model.body_weldid[model.body_parentid[wb]])
+                parents = (
+                    model.body_weldid[model.body_parentid[wa]],
+                    model.body_weldid[model.body_parentid[wb]],
+                )
                 if wb == parents[0] or wa == parents[1]:
                     continue
                 lo, hi = min(ba, bb), max(ba, bb)
@@ -631,7 +661,9 @@ class Kinematics:
 
     def com_jacobian(self) -> np.ndarray:
         """(3, nv), valid until the next call."""
-        mujoco.mj_jacSubtreeCom(self.world.model, self.data, self._jacp, self.world.base)
+        mujoco.mj_jacSubtreeCom(
+            self.world.model, self.data, self._jacp, self.world.base
+        )
         return self._jacp
 
     def rotation(self, body: int) -> np.ndarray:
@@ -642,7 +674,9 @@ class Kinematics:
         """(..., 3) world position of points (..., 3) of a body."""
         return self.data.xpos[body] + p_B @ self.data.xmat[body].reshape(3, 3).T
 
-    def point_jacobian(self, body: int, point: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    def point_jacobian(
+        self, body: int, point: np.ndarray, out: np.ndarray | None = None
+    ) -> np.ndarray:
         """(3, nv) of the body's point that is at `point` in the world."""
         jac = self._jacp if out is None else out
         mujoco.mj_jac(self.world.model, self.data, jac, None, point, body)
@@ -674,7 +708,9 @@ class Kinematics:
         s = self.world.surface(surface, edge)
         return self.point(s.body, s.corners) - s.radius * normal
 
-    def roll(self, surface: str, normal: np.ndarray, link: np.ndarray | None) -> np.ndarray:
+    def roll(
+        self, surface: str, normal: np.ndarray, link: np.ndarray | None
+    ) -> np.ndarray:
         """(3,) how far a round surface's contact has rolled from where its link was.
 
         For a turn theta of the link, r theta x n: exact about one axis.
@@ -705,7 +741,9 @@ class Kinematics:
         k = self._plane_any
         gap[k] = np.where(
             self._plane[k],
-            x[self._second[k], 2] - x[self._first[k], 2] - self._radius[self._second[k]],
+            x[self._second[k], 2]
+            - x[self._first[k], 2]
+            - self._radius[self._second[k]],
             x[self._first[k], 2] - x[self._second[k], 2] - self._radius[self._first[k]],
         )
         for k, box, other in (
@@ -726,7 +764,9 @@ class Kinematics:
         keep, dist, points = [], [], []
         f = self._fromto
         for i in idx:
-            s = mujoco.mj_geomDistance(m, d, int(self._first[i]), int(self._second[i]), reach, f)
+            s = mujoco.mj_geomDistance(
+                m, d, int(self._first[i]), int(self._second[i]), reach, f
+            )
             if s < reach:
                 keep.append(i)
                 dist.append(s)
@@ -788,7 +828,11 @@ def limb_lengths(kin: Kinematics) -> dict[str, float]:
         ("thigh", ("root", "middle")),
         ("shank", ("middle", "end")),
     ):
-        limbs = [x for x in kin.world.robot.limbs.values() if x.is_arm == (part in ("upper_arm", "forearm"))]
+        limbs = [
+            x
+            for x in kin.world.robot.limbs.values()
+            if x.is_arm == (part in ("upper_arm", "forearm"))
+        ]
         ends = [[kin.landmark(getattr(x, n))[1] for n in names] for x in limbs]
         out[part] = float(np.mean([np.linalg.norm(b - a) for a, b in ends]))
     return out

@@ -9,6 +9,8 @@ distance a constraint, so the push is the constraint's doing.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -61,12 +63,14 @@ class Path:
     note: str = ""
 
 
-def arc(p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int) -> np.ndarray:
+def arc(
+    p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int
+) -> np.ndarray:
     """Control points (points, 3) of the arc from `p1` to `p2` (4.29).
 
-    The apex is at `max(z_mid + ||p1 - p2|| / 2, h_obs + h_safe)` above the ground; where
-    both ends are already on top it is capped to `z + 0.05 + h_safe`. The arc is the
-    parabola in height through both ends and the apex, its horizontal part straight.
+    The apex is at `max(z_mid + ||p1 - p2|| / 2, h_obs + h_safe)` above the ground;
+    where both ends are already on top it is capped to `z + 0.05 + h_safe`. The arc is
+    the parabola in height through both ends and the apex, its horizontal part straight.
 
     Args:
         p1: (3,) present contact point.
@@ -75,7 +79,9 @@ def arc(p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int) -
         on_top: Both ends lie on obstacles.
         points: At least five.
     """
-    apex = max(0.5 * (p1[2] + p2[2]) + 0.5 * float(np.linalg.norm(p1 - p2)), top + SAFE_HEIGHT)
+    apex = max(
+        0.5 * (p1[2] + p2[2]) + 0.5 * float(np.linalg.norm(p1 - p2)), top + SAFE_HEIGHT
+    )
     if on_top:
         apex = min(apex, max(p1[2], p2[2]) + TOP_RISE + SAFE_HEIGHT)
     s = np.linspace(0.0, 1.0, max(points, 5))
@@ -87,7 +93,7 @@ def arc(p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int) -
 
 
 def _bulge(z1: float, z2: float, apex: float) -> float:
-    """Coefficient c whose parabola has its maximum at `apex` (0 where an end is higher)."""
+    """Coefficient c of the parabola that peaks at `apex`; 0 where an end is higher."""
     a, b = apex - z1, apex - z2
     if a <= 0 or b <= 0:
         return 0.0
@@ -113,11 +119,24 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     made = (*t.held, t.move.makes) if t.move.makes else t.held
     settle = _bridge(ik, t.touching, t.after, made, after)
     phases = (
-        Phase(kind="shift", q=shift, contacts=closed, load_before=before, load_after=t.held),
         Phase(
-            kind="swing", q=swing, contacts=t.held, load_before=t.held, load_after=t.held, arc=control
+            kind="shift",
+            q=shift,
+            contacts=closed,
+            load_before=before,
+            load_after=t.held,
         ),
-        Phase(kind="settle", q=settle, contacts=made, load_before=t.held, load_after=made),
+        Phase(
+            kind="swing",
+            q=swing,
+            contacts=t.held,
+            load_before=t.held,
+            load_after=t.held,
+            arc=control,
+        ),
+        Phase(
+            kind="settle", q=settle, contacts=made, load_before=t.held, load_after=made
+        ),
     )
     status, note = check_phases(ik, phases, t)
     return Path(transition=t, phases=phases, status=status, note=note)
@@ -142,13 +161,19 @@ def _bridge_problem(
 
 
 def _bridge(
-    ik: IK, a: np.ndarray, b: np.ndarray, contacts: tuple[Contact, ...], loaded: tuple[str, ...]
+    ik: IK,
+    a: np.ndarray,
+    b: np.ndarray,
+    contacts: tuple[Contact, ...],
+    loaded: tuple[str, ...],
 ) -> np.ndarray:
     """Postures from `a` to `b` with all contacts closed."""
 
     def between(q: np.ndarray) -> np.ndarray:
         return ik.solve(
-            _bridge_problem(ik.world, contacts, loaded, q), q, iterations=NODE_ITERATIONS
+            _bridge_problem(ik.world, contacts, loaded, q),
+            q,
+            iterations=NODE_ITERATIONS,
         ).q
 
     n = BRIDGE_POINTS + 1
@@ -169,7 +194,6 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
         c.surface == made.surface and c.support == made.support for c in t.leaving
     )
     control = arc(p1, made.position, support.position[2], was_on_top, ARC_POINTS)
-    touching = {made.surface: made.support}
     rotation = support_rotation(support, made.quaternion)
     nodes = [t.shifted]
     q = t.shifted
@@ -185,26 +209,33 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
             reference=ARC_WEIGHT,
         )
         problem = balance_problem(
-            world, held=t.held, q_reference=reference, extra=(goal,), posture_weight=0.3,
+            world,
+            held=t.held,
+            q_reference=reference,
+            extra=(goal,),
+            posture_weight=0.3,
         )
-        problem = replace(problem, clearance=_swing_clearance(ik, problem.clearance, t, i / n))
+        problem = replace(
+            problem, clearance=_swing_clearance(ik, problem.clearance, t, i / n)
+        )
         if not adapt:
             problem = replace(problem, clearance=np.full(len(world.pairs), -np.inf))
         q = ik.solve(problem, q, iterations=NODE_ITERATIONS).q
         nodes.append(q)
     nodes.append(t.touching)
-    del touching
     return np.array(nodes), control
 
 
-def _swing_clearance(ik: IK, clearance: np.ndarray, t: Transition, s: float) -> np.ndarray:
-    """Let the clearance of the moving limb grow from, and shrink to, what its ends have.
+def _swing_clearance(
+    ik: IK, clearance: np.ndarray, t: Transition, s: float
+) -> np.ndarray:
+    """Let clearances grow from, and shrink to, what the end postures have.
 
     At lift-off and touch-down the limb is as near to the supports as the end postures
     are; asking for the full distance at once would tear it off them sideways.
     """
     out = clearance
-    kin, world = ik.kin, ik.world
+    kin = ik.kin
     ramp = min(1.0, 5.0 * s, 5.0 * (1.0 - s))
     if ramp >= 1.0:
         return out
@@ -214,8 +245,9 @@ def _swing_clearance(ik: IK, clearance: np.ndarray, t: Transition, s: float) -> 
     floor = np.minimum(near.distance, CLEARANCE)
     finite = np.isfinite(out[near.pairs])
     k = near.pairs[finite]
-    out[k] = np.minimum(out[k], np.maximum(floor[finite], 0.0) * (1 - ramp) + ramp * CLEARANCE)
-    del world
+    out[k] = np.minimum(
+        out[k], np.maximum(floor[finite], 0.0) * (1 - ramp) + ramp * CLEARANCE
+    )
     return out
 
 
@@ -228,7 +260,9 @@ def _free_swing(ik: IK, t: Transition) -> np.ndarray:
 
     n = 5
     nodes = [t.shifted]
-    nodes += [between(interpolate(ik.kin, t.shifted, t.touching, i / n)) for i in range(1, n)]
+    nodes += [
+        between(interpolate(ik.kin, t.shifted, t.touching, i / n)) for i in range(1, n)
+    ]
     nodes.append(t.touching)
     return _refine(ik, nodes, t.held, between)
 
@@ -239,11 +273,16 @@ def _drift(ik: IK, q: np.ndarray, contacts: tuple[Contact, ...]) -> float:
     return max((contact_drift(ik.kin, c) for c in contacts), default=0.0)
 
 
-def _refine(ik: IK, nodes: list[np.ndarray], contacts: tuple[Contact, ...], between) -> np.ndarray:
+def _refine(
+    ik: IK,
+    nodes: list[np.ndarray],
+    contacts: tuple[Contact, ...],
+    between: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
     """Halve the gaps in whose middle a contact has drifted."""
     for _ in range(MAX_REFINEMENTS):
         out = [nodes[0]]
-        for a, b in zip(nodes, nodes[1:], strict=False):
+        for a, b in itertools.pairwise(nodes):
             mid = interpolate(ik.kin, a, b, 0.5)
             if _drift(ik, mid, contacts) > DRIFT_TOL:
                 out.append(between(mid))
@@ -254,8 +293,10 @@ def _refine(ik: IK, nodes: list[np.ndarray], contacts: tuple[Contact, ...], betw
     return np.array(nodes)
 
 
-def check_phases(ik: IK, phases: tuple[Phase, ...], t: Transition) -> tuple[Status, str]:
-    """Distances and contacts at every posture and half-way between, without the solver."""
+def check_phases(
+    ik: IK, phases: tuple[Phase, ...], t: Transition
+) -> tuple[Status, str]:
+    """Distances and contacts at all postures and half-way between, solver aside."""
     kin, world = ik.kin, ik.world
     worst, note = 0.0, ""
     moving = {s: None for s in t.move.breaks}
@@ -278,9 +319,16 @@ def check_phases(ik: IK, phases: tuple[Phase, ...], t: Transition) -> tuple[Stat
                 if len(near.distance) and -near.distance.min() > worst:
                     i = int(np.argmin(near.distance))
                     worst = -float(near.distance[i])
-                    pair = [world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]]]
-                    note = f"{' and '.join(pair)} overlap by {1e3 * worst:.1f} mm ({phase.kind})"
+                    pair = [
+                        world.model.geom(int(g)).name
+                        for g in world.pairs[near.pairs[i]]
+                    ]
+                    depth = f"{1e3 * worst:.1f} mm ({phase.kind})"
+                    note = f"{' and '.join(pair)} overlap by {depth}"
                 drift = _drift(ik, q, phase.contacts)
                 if drift > 0.02:
-                    return Status.UNREACHABLE, f"contact open by {1e3 * drift:.0f} mm ({phase.kind})"
+                    return (
+                        Status.UNREACHABLE,
+                        f"contact open by {1e3 * drift:.0f} mm ({phase.kind})",
+                    )
     return (Status.COLLIDING, note) if worst > 0.004 else (Status.SOLVED, note)

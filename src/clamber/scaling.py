@@ -77,7 +77,12 @@ def _ground_start(sequence: ContactSequence) -> np.ndarray:
 def _box_names(sequence: ContactSequence, world: World) -> dict[str, str]:
     """Robot's box for each of the person's, in the order in which they are touched."""
     touched = list(
-        dict.fromkeys(c.support for s in sequence.stances for c in s.contacts if c.support != GROUND)
+        dict.fromkeys(
+            c.support
+            for s in sequence.stances
+            for c in s.contacts
+            if c.support != GROUND
+        )
     )
     boxes = [b.name for b in world.scene.boxes]
     if len(boxes) < len(touched):
@@ -104,7 +109,10 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
     names = _box_names(sequence, world)
     there_start, here_start = _ground_start(sequence), world.scene.start[:2]
     edges = {
-        a: (near_edge(sequence.scene.support(a), there_start), near_edge(world.supports[b], here_start))
+        a: (
+            near_edge(sequence.scene.support(a), there_start),
+            near_edge(world.supports[b], here_start),
+        )
         for a, b in names.items()
     }
     yaw = world.scene.start[2]
@@ -112,7 +120,9 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
         there, here = next(iter(edges.values()))
         turn = here.rotation @ there.rotation.T
     else:
-        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+        turn = np.array(
+            [[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]]
+        )
     first: dict[str, np.ndarray] = {}
 
     def move(c: Contact) -> Contact | None:
@@ -128,15 +138,24 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
             there, here = edges[c.support]
             support = names[c.support]
             local = there.to_local(c.position)
-            position = here.to_world(np.array([scale * local[0], scale * local[1], 0.0]))
+            position = here.to_world(
+                np.array([scale * local[0], scale * local[1], 0.0])
+            )
             s = world.supports[support]
             position = position - s.normal * s.height(position)
         R = turn @ matrix_from_quat(c.quaternion)
-        return Contact(surface=c.surface, support=support, position=position, quaternion=quat_from_matrix(R))
+        return Contact(
+            surface=c.surface,
+            support=support,
+            position=position,
+            quaternion=quat_from_matrix(R),
+        )
 
     stances = []
     for s in sequence.stances:
         moved = tuple(x for x in map(move, s.contacts) if x is not None)
         posture = {n: turn @ u for n, u in s.posture.items()}
         stances.append(Stance(contacts=moved, posture=posture))
-    return replace(sequence, scene=world.scene, stances=tuple(stances), subject=None, intervals=())
+    return replace(
+        sequence, scene=world.scene, stances=tuple(stances), subject=None, intervals=()
+    )

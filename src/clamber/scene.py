@@ -27,7 +27,9 @@ MAX_LENGTH = 50.0  # [m] a larger box is a wrong unit
 
 def _frozen(x: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
     out = np.array(x, dtype=float)
-    if out.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, out.shape, strict=True)):
+    if out.ndim != len(shape) or any(
+        s not in (-1, n) for s, n in zip(shape, out.shape, strict=True)
+    ):
         raise ValueError(f"shape {out.shape}, expected {shape}")
     out.setflags(write=False)
     return out
@@ -107,7 +109,14 @@ class Box:
         axis = int(np.argmax(np.abs(self.rotation[2])))
         sign = 1.0 if self.rotation[2, axis] >= 0 else -1.0
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        R = np.stack([self.rotation[:, i], self.rotation[:, j] * sign, self.rotation[:, axis] * sign], axis=1)
+        R = np.stack(
+            [
+                self.rotation[:, i],
+                self.rotation[:, j] * sign,
+                self.rotation[:, axis] * sign,
+            ],
+            axis=1,
+        )
         hx, hy = self.size[i] / 2, self.size[j] / 2
         return Support(
             name=self.name,
@@ -165,7 +174,9 @@ class Scene:
         for s in self.supports:
             if s.name == name:
                 return s
-        raise KeyError(f"no support {name!r}; there are {[s.name for s in self.supports]}")
+        raise KeyError(
+            f"no support {name!r}; there are {[s.name for s in self.supports]}"
+        )
 
     @classmethod
     def from_height(cls, height: float, friction: float = 0.8) -> Scene:
@@ -189,7 +200,9 @@ def _finite(x: float) -> float:
     if not math.isfinite(x):
         raise ValueError("expected a finite number")
     if abs(x) > MAX_LENGTH:
-        raise ValueError(f"expected metres or radians, at most {MAX_LENGTH:g}: is it in millimetres?")
+        raise ValueError(
+            f"expected metres or radians, at most {MAX_LENGTH:g}: is it in millimetres?"
+        )
     return x
 
 
@@ -200,7 +213,9 @@ def _positive(x: float) -> float:
 
 
 Number = Annotated[float, pydantic.AfterValidator(_finite)]
-Length = Annotated[float, pydantic.AfterValidator(_finite), pydantic.AfterValidator(_positive)]
+Length = Annotated[
+    float, pydantic.AfterValidator(_finite), pydantic.AfterValidator(_positive)
+]
 Friction = Annotated[float, pydantic.Field(gt=0.0, le=1.0)]
 
 
@@ -286,7 +301,9 @@ def read_yaml(path: Path) -> dict:
     except (yaml.YAMLError, UnicodeDecodeError) as e:
         raise InputError(f"YAML ({str(e).splitlines()[0]})", source=path) from e
     if not isinstance(content, dict):
-        raise InputError("a mapping of fields", source=path, value=type(content).__name__)
+        raise InputError(
+            "a mapping of fields", source=path, value=type(content).__name__
+        )
     return content
 
 

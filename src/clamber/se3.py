@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike
 def matrix_from_rpy(rpy: ArrayLike) -> np.ndarray:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of fixed-axis angles [rad]."""
     r, p, y = np.asarray(rpy, dtype=float)
-    cr, sr, cp, sp, cy, sy = np.cos(r), np.sin(r), np.cos(p), np.sin(p), np.cos(y), np.sin(y)
+    cr, sr, cp, sp, cy, sy = (
+        np.cos(r),
+        np.sin(r),
+        np.cos(p),
+        np.sin(p),
+        np.cos(y),
+        np.sin(y),
+    )
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

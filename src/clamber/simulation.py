@@ -1,7 +1,7 @@
 """World, trajectory, controller -> rollout -> verdict: what physics makes of a plan.
 
-Nothing but `mj_step` touches the simulated state; the rollout holds the command of every
-step, so that plain MuJoCo arrives at the same states from the first one.
+Nothing but `mj_step` touches the simulated state; the rollout holds the command of
+every step, so that plain MuJoCo arrives at the same states from the first one.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Rollout:
             the world; unintended: (M,) normal force on other parts [N].
         surfaces: Names of the nS surfaces.
         overlap: Deepest overlap of the robot with itself and of anything else [m].
-        end_share: Vertical force, share of the weight, by `surface@support` over the last
+        end_share: Vertical force, share of the weight, by `surface@support` over the
+        last
             second; other parts are called `other`.
         unintended_share: Normal impulse on other parts over that on all.
         contact_tracking: (M,) contacts planned closed that are.
@@ -83,7 +84,9 @@ class Verdict:
     criteria: dict[str, Criterion]
 
 
-def simulate(plan: Plan, *, progress: Callable[[str, float, str], None] | None = None) -> Rollout:
+def simulate(
+    plan: Plan, *, progress: Callable[[str, float, str], None] | None = None
+) -> Rollout:
     """Run the trajectory of a plan in MuJoCo under joint PID.
 
     Raises:
@@ -91,7 +94,9 @@ def simulate(plan: Plan, *, progress: Callable[[str, float, str], None] | None =
     """
     if plan.trajectory is None:
         raise ValueError("the plan has no trajectory")
-    return _run(plan.world, plan.trajectory, progress or (lambda stage, share, note: None))
+    return _run(
+        plan.world, plan.trajectory, progress or (lambda stage, share, note: None)
+    )
 
 
 def _run(
@@ -129,7 +134,9 @@ def _run(
                 effort[row] = data.actuator_force
                 force[row], unintended[row] = forces, other
         if k % 1000 == 0:
-            report("simulate", k / n, f"{k * PHYSICS_STEP:.0f} of {n * PHYSICS_STEP:.0f} s")
+            report(
+                "simulate", k / n, f"{k * PHYSICS_STEP:.0f} of {n * PHYSICS_STEP:.0f} s"
+            )
     report("simulate", 1.0, "")
     self_overlap, pair = deepest_self_overlap(world, qpos)
     weight = world.mass * 9.81 * (n - tail)
@@ -148,7 +155,9 @@ def _run(
         self_pair=pair,
         end_share={k: v / weight for k, v in sorted(meter.end.items())},
         unintended_share=meter.other / max(meter.total, 1e-9),
-        unintended_parts={k: v / max(meter.total, 1e-9) for k, v in sorted(meter.parts.items())},
+        unintended_parts={
+            k: v / max(meter.total, 1e-9) for k, v in sorted(meter.parts.items())
+        },
         end_speed=speed,
     )
 
@@ -172,7 +181,7 @@ class _ContactMeter:
     def measure(
         self, data: mujoco.MjData, *, end: bool, total: bool
     ) -> tuple[np.ndarray, float]:
-        """(nS, 3) forces of the scene on the surfaces, and on other parts; adds to sums."""
+        """(nS, 3) forces on the surfaces, and that on all else; adds to sums."""
         forces, other = np.zeros((len(self.surfaces), 3)), 0.0
         for i in range(data.ncon):
             c = data.contact[i]
@@ -200,8 +209,10 @@ class _ContactMeter:
         return forces, other
 
 
-def deepest_self_overlap(world: World, qpos: np.ndarray, every: int = 5) -> tuple[float, str]:
-    """Deepest overlap of the robot with itself over states (M, nq) [m], and the pair."""
+def deepest_self_overlap(
+    world: World, qpos: np.ndarray, every: int = 5
+) -> tuple[float, str]:
+    """Deepest overlap of the robot with itself in states (M, nq) [m], and where."""
     from clamber.model import Kinematics
 
     kin = Kinematics(world)
@@ -214,7 +225,9 @@ def deepest_self_overlap(world: World, qpos: np.ndarray, every: int = 5) -> tupl
         if len(near.distance) and -near.distance.min() > worst:
             i = int(np.argmin(near.distance))
             worst = -float(near.distance[i])
-            pair = " and ".join(world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]])
+            pair = " and ".join(
+                world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]]
+            )
     return worst, pair
 
 
@@ -233,9 +246,13 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     effort = float(np.abs(rollout.actuator_force).max() / world.tau_max.max())
     goal = {
         "planned to the last stance": _at_least(float(plan.complete), 1.0),
-        "share of the weight at the end on planned contacts": _at_least(on_plan, SHARE_ON_PLAN),
+        "share of the weight at the end on planned contacts": _at_least(
+            on_plan, SHARE_ON_PLAN
+        ),
         "pelvis speed at the end [m/s]": _at_most(rollout.end_speed, END_SPEED),
-        "pelvis tilt at the end against the plan [rad]": _at_most(tilt, float(TILT_TOL)),
+        "pelvis tilt at the end against the plan [rad]": _at_most(
+            tilt, float(TILT_TOL)
+        ),
         "pelvis height at the end against the plan [m]": _at_most(
             float(abs(last[2] - planned[2])), HEIGHT_TOL
         ),
@@ -253,7 +270,9 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
         )
     else:
         xy = world.scene.goal[:2]
-        goal["pelvis to the goal [m]"] = _at_most(float(np.linalg.norm(last[:2] - xy)), GOAL_TOL)
+        goal["pelvis to the goal [m]"] = _at_most(
+            float(np.linalg.norm(last[:2] - xy)), GOAL_TOL
+        )
         if len(world.scene.goal) == 3:
             w, x, y, z = last[3:7]
             yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -2,8 +2,9 @@
 
 Each phase is a cubic spline through its postures, at rest at both ends, parametrised by
 the largest joint angle travelled; time runs along it under a velocity profile that
-accelerates, cruises at the speed limit and brakes. The base's rotation is the normalised
-spline of its quaternion, so that the angular velocity is its derivative on the manifold.
+accelerates, cruises at the speed limit and brakes. The base's rotation is the
+normalised spline of its quaternion, so that the angular velocity is its derivative on
+the manifold.
 
 Feed-forward torques balance gravity with the contact forces of least norm at every
 posture, and are interpolated along the spline.
@@ -11,6 +12,7 @@ posture, and are interpolated along the spline.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -91,7 +93,9 @@ def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
     return (1 - share) * np.array(ends[0]) + share * np.array(ends[1])
 
 
-def holding_torque(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> np.ndarray:
+def holding_torque(
+    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
+) -> np.ndarray:
     """(na,) joint torques that balance gravity with the least contact forces."""
     w = kin.world
     kin.update(q)
@@ -106,7 +110,7 @@ def holding_torque(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
     """(n,) path parameter: the largest joint angle travelled, base included, scaled."""
     steps = [0.0]
-    for a, b in zip(nodes, nodes[1:], strict=False):
+    for a, b in itertools.pairwise(nodes):
         d = kin.difference(a, b)
         d[:3] /= BASE_LENGTH
         steps.append(max(float(np.abs(d).max()), 1e-6))
@@ -134,7 +138,9 @@ def _on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.nda
     norm = np.linalg.norm(raw[:, 3:7], axis=1, keepdims=True)
     unit = raw[:, 3:7] / norm
     q[:, 3:7] = unit
-    rate = (slope[:, 3:7] - unit * np.sum(unit * slope[:, 3:7], axis=1, keepdims=True)) / norm
+    rate = (
+        slope[:, 3:7] - unit * np.sum(unit * slope[:, 3:7], axis=1, keepdims=True)
+    ) / norm
     omega = 2.0 * quat_multiply(quat_conjugate(unit), rate)[:, 1:]
     return q, np.concatenate([slope[:, :3], omega, slope[:, 7:]], axis=1)
 
@@ -189,7 +195,11 @@ def _profile(length: float, cruise: float) -> np.ndarray:
 
 
 def build_trajectory(
-    world: World, phases: Sequence[Phase], *, speed: float, keyframe_after: Sequence[int] = ()
+    world: World,
+    phases: Sequence[Phase],
+    *,
+    speed: float,
+    keyframe_after: Sequence[int] = (),
 ) -> Trajectory:
     """Time the phases one after the other.
 
@@ -206,7 +216,9 @@ def build_trajectory(
     surfaces = tuple(world.surfaces)
     q, v, tau, contact, ends = [], [], [], [], []
 
-    def hold(seconds: float, phase: Phase, posture: np.ndarray, torque: np.ndarray) -> None:
+    def hold(
+        seconds: float, phase: Phase, posture: np.ndarray, torque: np.ndarray
+    ) -> None:
         n = round(seconds * RATE)
         q.append(np.tile(posture, (n, 1)))
         v.append(np.zeros((n, world.model.nv)))
@@ -217,7 +229,9 @@ def build_trajectory(
     samples = 0
     for i, phase in enumerate(phases):
         if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
-            raise ValueError(f"phase {i} ({phase.kind}) does not begin where the last one ended")
+            raise ValueError(
+                f"phase {i} ({phase.kind}) does not begin where the last one ended"
+            )
         spline = _spline(kin, phase, speed, world.v_max)
         if i == 0:
             first, _ = spline.sample(np.zeros(1), np.zeros(1))

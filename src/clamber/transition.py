@@ -1,9 +1,9 @@
 """Neighbouring keyframes -> the postures that move one contact.
 
-A move makes, breaks or replaces the contact of one limb. Its transition first shifts the
-weight onto the contacts that stay, then closes the new contact, unloaded, in
-reach-to-support mode (4.26, 4.27), and ends in the next keyframe, loaded. The shift
-holds the centre of mass inside the ellipse of the remaining contacts (4.28).
+A move makes, breaks or replaces the contact of one limb. Its transition first shifts
+the weight onto the contacts that stay, then closes the new contact, unloaded, in reach-
+to-support mode (4.26, 4.27), and ends in the next keyframe, loaded. The shift holds the
+centre of mass inside the ellipse of the remaining contacts (4.28).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import World
+from clamber.moves import Move
 from clamber.posture.ik import (
     IK,
     ContactGoal,
@@ -34,28 +35,6 @@ ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
 LEAN_WEIGHT = 0.5  # soft task (4.27)
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
 REACH_TOL = 0.02  # [m] a contact farther off than this is somewhere else
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Move:
-    """One limb's change of contact.
-
-    Attributes:
-        limb: Its name.
-        breaks: Surfaces that leave their contacts.
-        makes: The contact that is made, its position a reference until optimised.
-        firm: The position is taken as it is, or as near as can be reached.
-    """
-
-    limb: str
-    breaks: tuple[str, ...]
-    makes: Contact | None
-    firm: bool = False
-
-    def __str__(self) -> str:
-        """Such as `LHand -> LElbow on box`."""
-        made = f"{self.makes.surface} on {self.makes.support}" if self.makes else "air"
-        return f"{', '.join(self.breaks) or 'air'} -> {made}"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -108,7 +87,9 @@ def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarr
     pitch, roll, _ = reach_to_support(p1, p2, R_WB)
     horizontal = R_WB @ np.array([np.sin(pitch), np.sin(roll), 0.0])
     horizontal[2] = 0.0
-    return horizontal + np.array([0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))])
+    return horizontal + np.array(
+        [0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))]
+    )
 
 
 def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
@@ -122,7 +103,9 @@ def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
         return c
     ik.kin.update(q)
     normal = ik.world.supports[c.support].normal
-    points = np.array([ik.kin.contact_point(c.surface, normal, i) for i in range(len(edges))])
+    points = np.array(
+        [ik.kin.contact_point(c.surface, normal, i) for i in range(len(edges))]
+    )
     i = int(np.argmax(points @ (towards - c.position)))
     return replace(c, edge=i, position=points[i])
 
@@ -147,7 +130,9 @@ def balance_problem(
             *extra,
         ),
         q_reference=q_reference,
-        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where, rolling),
+        clearance=contact_clearance(
+            world, base_clearance(world, CLEARANCE), where, rolling
+        ),
         balance_margin=BALANCE_MARGIN,
         posture_weight=posture_weight,
         ellipse_weight=ELLIPSE_WEIGHT,
@@ -156,7 +141,9 @@ def balance_problem(
     )
 
 
-def plan_transition(ik: IK, before: Keyframe, after: Keyframe, move: Move) -> Transition:
+def plan_transition(
+    ik: IK, before: Keyframe, after: Keyframe, move: Move
+) -> Transition:
     """Shift, touch and settle between two keyframes.
 
     The new contact may still give way by `REACH_TOL` where the unloaded robot cannot
@@ -168,7 +155,8 @@ def plan_transition(ik: IK, before: Keyframe, after: Keyframe, move: Move) -> Tr
     middle = np.mean([c.position for c in held], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
     shift = ik.solve(
-        balance_problem(world, held=held, closed=rolling, q_reference=before.q), before.q
+        balance_problem(world, held=held, closed=rolling, q_reference=before.q),
+        before.q,
     )
     solutions = [shift]
     if move.makes is None:
@@ -196,9 +184,13 @@ def plan_transition(ik: IK, before: Keyframe, after: Keyframe, move: Move) -> Tr
 
 
 def _touch(
-    ik: IK, held: tuple[Contact, ...], made: Contact, shifted: np.ndarray, after: np.ndarray
+    ik: IK,
+    held: tuple[Contact, ...],
+    made: Contact,
+    shifted: np.ndarray,
+    after: np.ndarray,
 ) -> Solution:
-    """Close the new contact, starting from the loaded posture, the weight still held."""
+    """Close the new contact from the loaded posture, the weight still on the rest."""
     world, kin = ik.world, ik.kin
     kin.update(shifted)
     support = world.supports[made.support]

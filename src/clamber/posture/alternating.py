@@ -1,4 +1,4 @@
-"""The alternation that `gradient` and `lbfgs` share: positions, then posture, and again.
+"""What `gradient` and `lbfgs` share: positions, then posture, and again.
 
 The variables are the new contacts' coordinates in their supports' planes, inside the
 supports' bounds (4.21). A position out of reach is pulled back to the nearest that the
@@ -28,13 +28,17 @@ FIRST_ITERATIONS = 60
 class Alternation:
     """Evaluates L_s as a function of the contact positions alone."""
 
-    def __init__(self, ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions) -> None:
+    def __init__(
+        self, ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions
+    ) -> None:
         """Remember the stance; `start` gives the first variables."""
         self.ik, self.task, self.options, self.q = ik, task, options, q
         self.supports = [ik.world.supports[c.support] for c in task.new]
         ik.kin.update(q)
         references = np.array([c.position for c in task.new]).reshape(-1, 3)
-        self.before, _ = stability_cost(ik.kin, task, references, options.stability_weight)
+        self.before, _ = stability_cost(
+            ik.kin, task, references, options.stability_weight
+        )
         self._fresh = True
 
     def start(self) -> np.ndarray:
@@ -49,7 +53,10 @@ class Alternation:
         """(2n,) moved inside the supports' bounds."""
         out = x.copy().reshape(-1, 2)
         for i, s in enumerate(self.supports):
-            lo, hi = s.polygon.min(axis=0) + EDGE_INSET, s.polygon.max(axis=0) - EDGE_INSET
+            lo, hi = (
+                s.polygon.min(axis=0) + EDGE_INSET,
+                s.polygon.max(axis=0) - EDGE_INSET,
+            )
             out[i] = np.clip(out[i], lo, np.maximum(lo, hi))
         return out.ravel()
 
@@ -63,10 +70,13 @@ class Alternation:
         ).reshape(-1, 3)
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """L_s and its gradient (n, 2), in the supports' planes, after the IK for `x`."""
+        """L_s and its gradient (n, 2) in the supports' planes, after IK for `x`."""
         self._solve(x)
         cost, grad = stability_cost(
-            self.ik.kin, self.task, new_positions(self.ik.kin, self.task), self.options.stability_weight
+            self.ik.kin,
+            self.task,
+            new_positions(self.ik.kin, self.task),
+            self.options.stability_weight,
         )
         for i, s in enumerate(self.supports):
             grad[i] = s.rotation[:2, :2].T @ grad[i]

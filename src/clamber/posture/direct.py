@@ -21,7 +21,9 @@ from clamber.posture.keyframe import (
 )
 
 
-def optimise(ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions) -> Keyframe:
+def optimise(
+    ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions
+) -> Keyframe:
     """A stable posture for the stance, starting from `q` (nq,)."""
     world = ik.world
     ik.kin.update(q)

@@ -28,7 +28,12 @@ from clamber.errors import Status
 from clamber.model import Kinematics, World
 from clamber.scene import Support
 from clamber.se3 import frame_from_normal, matrix_from_quat, rotation_vector
-from clamber.statics import com_margin, polygon_halfplanes, support_ellipse, support_polygon
+from clamber.statics import (
+    com_margin,
+    polygon_halfplanes,
+    support_ellipse,
+    support_polygon,
+)
 
 STEP_ROTATION = 0.15  # [rad] largest joint step of one iteration
 STEP_TRANSLATION = 0.08  # [m] largest step of the base
@@ -41,7 +46,7 @@ CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
-EDGE_INSET = .015  # [m] contacts stay this far inside the support's border
+EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
 SOFT, EQUALITY = 8, 5  # daqp's constraint types
 
 
@@ -51,12 +56,15 @@ class ContactGoal:
 
     Attributes:
         surface, support: Names.
-        position: (3,) where the contact holds (`free` False), or where it would be liked.
+        position: (3,) where the contact holds (`free` False), or where it would be
+        liked.
         rotation: (3, 3) R_WC of a flat surface in contact.
         free: The position along the support is left to the optimiser.
-        hard: In contact; False for a surface that moves there (a soft target in the air).
+        hard: In contact; False for a surface that moves there (a soft target in the
+        air).
         loaded: It may bear force, and counts for the support polygon.
-        stability: Weight of (4.25), the horizontal distance from the contact to the mass
+        stability: Weight of (4.25), the horizontal distance from the contact to the
+        mass
             it supports; only for free contacts.
         reference: Weight of the distance to `position`; free contacts and moving ones.
         edge: The edge that a held flat surface may roll on; None keeps it flat.
@@ -86,7 +94,8 @@ class PostureProblem:
         q_reference: (nq,) preferred posture; its weight acts on the joints alone.
         directions: Unit vectors (3,) of body segments in the world, by name.
         base_rotation: (3, 3) preferred R_WB of the pelvis, or None.
-        clearance: (P,) least distance of each pair [m]; -inf where a pair does not count.
+        clearance: (P,) least distance of each pair [m]; -inf where a pair does not
+        count.
         balance: Keep the centre of mass over the loaded contacts.
         balance_margin: [m] from the border of the support polygon.
         posture_weight, direction_weight, base_weight, com_weight: Of the soft tasks.
@@ -98,7 +107,9 @@ class PostureProblem:
     goals: tuple[ContactGoal, ...]
     q_reference: np.ndarray
     clearance: np.ndarray
-    directions: Mapping[str, np.ndarray] = field(default_factory=lambda: MappingProxyType({}))
+    directions: Mapping[str, np.ndarray] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
     base_rotation: np.ndarray | None = None
     balance: bool = True
     balance_margin: float = 0.025
@@ -317,7 +328,11 @@ class IK:
             lo=np.concatenate([lo, hard.lo[: hard.n], ineq.lo[: ineq.n]]),
             hi=np.concatenate([hi, hard.lo[: hard.n], ineq.hi[: ineq.n]]),
             sense=np.concatenate(
-                [np.zeros(nv, np.int32), np.full(hard.n, EQUALITY, np.int32), np.full(ineq.n, SOFT, np.int32)]
+                [
+                    np.zeros(nv, np.int32),
+                    np.full(hard.n, EQUALITY, np.int32),
+                    np.full(ineq.n, SOFT, np.int32),
+                ]
             ),
             merit=cost + 0.5 * PENALTY * self._violation,
         )
@@ -420,15 +435,23 @@ class IK:
         short = problem.clearance[near.pairs] - near.distance
         worst = int(np.argmax(short)) if len(short) else -1
         _, points = self._bearing(problem)
-        margin = com_margin(kin.com[:2], support_polygon(points[:, :2])) if len(points) else -np.inf
+        margin = (
+            com_margin(kin.com[:2], support_polygon(points[:, :2]))
+            if len(points)
+            else -np.inf
+        )
         dof = w.dadr
         over = np.maximum(w.q_min[dof] - q[w.qadr], q[w.qadr] - w.q_max[dof])
         return Residuals(
             contact=contact,
             distance=max(float(short[worst]), 0.0) if worst >= 0 else 0.0,
-            balance=max(problem.balance_margin - margin, 0.0) if problem.balance else 0.0,
+            balance=max(problem.balance_margin - margin, 0.0)
+            if problem.balance
+            else 0.0,
             limits=max(float(over.max()), 0.0),
-            worst_pair=int(near.pairs[worst]) if worst >= 0 and short[worst] > 0 else -1,
+            worst_pair=int(near.pairs[worst])
+            if worst >= 0 and short[worst] > 0
+            else -1,
             com_margin=float(margin),
         )
 
@@ -441,13 +464,15 @@ class IK:
         p = kin.contact_point(g.surface, n, g.edge)
         jac, rot = kin.jacobians(s.body, p)
         if s.radius > 0 and g.link is None:
-            # The touching point of a ball stays under its centre: it moves as that does.
+            # The touching point stays under the centre: it moves as that does.
             jac = kin.point_jacobian(s.body, p + s.radius * n)
         target = g.position + kin.roll(g.surface, n, g.link)
         if not g.hard:
             self._target(jac, p - g.position, g.reference)
             if s.is_flat:
-                self._target(rot, -kin.flat_error(g.surface, g.rotation), 0.3 * g.reference)
+                self._target(
+                    rot, -kin.flat_error(g.surface, g.rotation), 0.3 * g.reference
+                )
             return
         if g.edge is not None:
             turn = kin.flat_error(g.surface, g.rotation)
@@ -509,7 +534,9 @@ class IK:
         along = g.rotation @ s.rotation.T @ (s.corners[1] - s.corners[0])
         return along / np.linalg.norm(along)
 
-    def _inside(self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray) -> None:
+    def _inside(
+        self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray
+    ) -> None:
         room = b - EDGE_INSET - A @ p
         near = room < 0.15
         if not near.any():
@@ -549,15 +576,21 @@ class IK:
             length = float(np.linalg.norm(b - a))
             kin.point_jacobian(body_b, b, self._jac)
             kin.point_jacobian(body_a, a, self._jac2)
-            self._target((self._jac - self._jac2) / length, (b - a) / length - u, problem.direction_weight)
+            self._target(
+                (self._jac - self._jac2) / length,
+                (b - a) / length - u,
+                problem.direction_weight,
+            )
 
     def _bearing(self, problem: PostureProblem) -> tuple[list[int], np.ndarray]:
-        """Body of each point that bears load, -1 where it stays put, and (n, 3) points."""
+        """Body of each point that bears load (-1: it stays put), and (n, 3) points."""
         bodies, points = [], []
         for g in problem.goals:
             if not (g.hard and g.loaded):
                 continue
-            p = self.kin.bearing_points(g.surface, self.world.supports[g.support].normal, g.edge)
+            p = self.kin.bearing_points(
+                g.surface, self.world.supports[g.support].normal, g.edge
+            )
             s = self.world.surfaces[g.surface]
             bodies += [s.body if g.free or not s.is_flat else -1] * len(p)
             points.append(p)
@@ -592,7 +625,10 @@ class IK:
             p, q = polygon[e], polygon[(e + 1) % len(polygon)]
             along = q - p
             t = float((com - p) @ along) / float(along @ along)
-            for share, vertex in ((1.0 - t, owner[e]), (t, owner[(e + 1) % len(polygon)])):
+            for share, vertex in (
+                (1.0 - t, owner[e]),
+                (t, owner[(e + 1) % len(polygon)]),
+            ):
                 J = jacobians.get(int(vertex))
                 if J is not None:
                     rows[e] -= share * (A[e] @ J)
@@ -618,7 +654,9 @@ class IK:
         if problem.ellipse_weight > 0:
             excess, gradient = support_ellipse(polygon).excess(com)
             if excess > 0:
-                self._target((gradient @ J)[None], np.array([excess]), problem.ellipse_weight)
+                self._target(
+                    (gradient @ J)[None], np.array([excess]), problem.ellipse_weight
+                )
 
     def _lean_rows(self, surface: str, direction: np.ndarray, weight: float) -> None:
         kin = self.kin
@@ -628,7 +666,9 @@ class IK:
         length = float(np.linalg.norm(b - a))
         kin.point_jacobian(body, b, self._jac)
         kin.point_jacobian(s.body, a, self._jac2)
-        self._target((self._jac - self._jac2) / length, (b - a) / length - direction, weight)
+        self._target(
+            (self._jac - self._jac2) / length, (b - a) / length - direction, weight
+        )
 
     def _distance_rows(self, clearance: np.ndarray) -> None:
         kin = self.kin
@@ -638,7 +678,12 @@ class IK:
         k = self._ineq.take(len(near.pairs))
         pairs = self.world.pairs[near.pairs]
         for row, (a, b), n, p1, p2 in zip(
-            range(k.start, k.stop), self._geom_body[pairs], near.normal, near.first, near.second, strict=True
+            range(k.start, k.stop),
+            self._geom_body[pairs],
+            near.normal,
+            near.first,
+            near.second,
+            strict=True,
         ):
             if a and b:
                 kin.point_jacobian(int(b), p2, self._jac)
@@ -660,5 +705,5 @@ def _size(e: np.ndarray) -> float:
 
 
 def support_rotation(support: Support, quaternion: np.ndarray) -> np.ndarray:
-    """R_WC of a contact whose z is the support's normal and whose x is the quaternion's."""
+    """R_WC: z along the support's normal, x as near to the quaternion's as it can."""
     return frame_from_normal(support.normal, matrix_from_quat(quaternion)[:, 0])

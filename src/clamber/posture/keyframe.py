@@ -63,7 +63,9 @@ class KeyframeTask:
     new: tuple[Contact, ...]
     q_reference: np.ndarray
     fixed: bool = False
-    directions: Mapping[str, np.ndarray] = field(default_factory=lambda: MappingProxyType({}))
+    directions: Mapping[str, np.ndarray] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
     base_rotation: np.ndarray | None = None
 
 
@@ -165,7 +167,9 @@ def keyframe_problem(
     )
 
 
-def prescribed_goals(world: World, task: KeyframeTask, positions: np.ndarray) -> tuple[ContactGoal, ...]:
+def prescribed_goals(
+    world: World, task: KeyframeTask, positions: np.ndarray
+) -> tuple[ContactGoal, ...]:
     """New contacts wanted at `positions` (n, 3), closed on their supports."""
     return tuple(
         ContactGoal(
@@ -200,7 +204,9 @@ def stability_cost(
 def new_positions(kin: Kinematics, task: KeyframeTask) -> np.ndarray:
     """(n, 3) where the new contacts touch at the present posture."""
     supports = kin.world.supports
-    return np.array([kin.contact_point(c.surface, supports[c.support].normal) for c in task.new]).reshape(-1, 3)
+    return np.array(
+        [kin.contact_point(c.surface, supports[c.support].normal) for c in task.new]
+    ).reshape(-1, 3)
 
 
 def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> ContactState:
@@ -234,11 +240,14 @@ def bearing_frames(
 
 
 def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEquilibrium:
-    """Static equilibrium with friction cones and torque limits at the present posture."""
+    """Static equilibrium with cones and torque limits at the present posture."""
     w = kin.world
     names, points, normals, mu = bearing_frames(kin, contacts)
     J = np.concatenate(
-        [kin.point_jacobian(w.surfaces[n].body, p).copy() for n, p in zip(names, points, strict=True)]
+        [
+            kin.point_jacobian(w.surfaces[n].body, p).copy()
+            for n, p in zip(names, points, strict=True)
+        ]
     )
     return static_equilibrium(
         points,
@@ -248,7 +257,11 @@ def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEqui
         w.mass,
         names=names,
         torque=TorqueLimits(
-            jacobian=J, gravity=kin.gravity(), dofs=w.dadr, limits=w.tau_max, names=w.joints
+            jacobian=J,
+            gravity=kin.gravity(),
+            dofs=w.dadr,
+            limits=w.tau_max,
+            names=w.joints,
         ),
     )
 
@@ -266,8 +279,9 @@ def finish(
     """Measure a posture: contacts where they are, margins, equilibrium, status.
 
     Geometry proposes and statics verifies: a posture counts as stable when every
-    constraint holds and forces within friction cones and torque limits exist. Where they
-    do not and a new contact is past its contact angle, that is named as the reason.
+    constraint holds and forces within friction cones and torque limits exist. Where
+    they do not and a new contact is past its contact angle, that is named as the
+    reason.
     """
     world = ik.world
     kin = ik.kin
@@ -287,13 +301,17 @@ def finish(
     )
     residuals = ik.residuals(keyframe_problem(world, measured, options, ()), q)
     states = tuple(contact_state(kin, c) for c in measured.held)
-    cost_after, _ = stability_cost(kin, task, new_positions(kin, task), options.stability_weight)
+    cost_after, _ = stability_cost(
+        kin, task, new_positions(kin, task), options.stability_weight
+    )
     com = kin.com.copy()
     equilibrium = equilibrium_at(kin, measured.held)
     status = residuals.status
     fresh = {c.surface for c in task.new}
     if status is Status.SOLVED and not equilibrium.feasible:
-        slides = any(s.phase == "sliding" and s.contact.surface in fresh for s in states)
+        slides = any(
+            s.phase == "sliding" and s.contact.surface in fresh for s in states
+        )
         status = Status.SLIDING if slides else Status.OVERLOADED
     return Keyframe(
         q=q,
@@ -321,6 +339,10 @@ def _orientation(kin: Kinematics, c: Contact) -> np.ndarray:
     """The contact's orientation: as reached by a flat surface, else as demonstrated."""
     s = kin.world.surfaces[c.surface]
     if s.rotation is None:
-        return quat_from_matrix(support_rotation(kin.world.supports[c.support], c.quaternion))
+        return quat_from_matrix(
+            support_rotation(kin.world.supports[c.support], c.quaternion)
+        )
     R = kin.rotation(s.body) @ s.rotation
-    return quat_from_matrix(support_rotation(kin.world.supports[c.support], quat_from_matrix(R)))
+    return quat_from_matrix(
+        support_rotation(kin.world.supports[c.support], quat_from_matrix(R))
+    )

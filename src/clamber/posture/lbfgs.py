@@ -9,7 +9,9 @@ from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions, KeyframeTask
 
 
-def optimise(ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions) -> Keyframe:
+def optimise(
+    ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions
+) -> Keyframe:
     """A stable posture for the stance, starting from `q` (nq,)."""
     from scipy.optimize import minimize
 

@@ -1,0 +1,231 @@
+"""Step after step: keyframe, transition, path; earlier contacts mended where needed.
+
+Each step is planned from the keyframe before it. Where a step fails because of where an
+earlier contact lies, that contact is put where the step would have liked it, and
+planning goes on from there; where nothing helps, the step is skipped with its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clamber.contact import Contact
+from clamber.errors import Status
+from clamber.moves import Move, Skipped, Step
+from clamber.path import Path, plan_path
+from clamber.posture import direct, gradient, lbfgs
+from clamber.posture.ik import IK, support_rotation
+from clamber.posture.keyframe import (
+    Keyframe,
+    KeyframeOptions,
+    KeyframeTask,
+    finish,
+)
+from clamber.scene import GROUND
+from clamber.se3 import quat_from_matrix
+from clamber.transition import (
+    approach_contact,
+    eased_contact,
+    plan_transition,
+)
+
+METHODS = {
+    "direct": direct.optimise,
+    "lbfgs": lbfgs.optimise,
+    "gradient": gradient.optimise,
+}
+MAX_REPAIRS = 4  # earlier contacts that may be put elsewhere for a later step's sake
+MOVED = 0.005  # [m] a repair by less is none
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Found:
+    """What the search found.
+
+    Attributes:
+        keyframes: The start, and one more for each path.
+        paths: Between neighbouring keyframes.
+        missed: Steps for which there is no way.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    paths: tuple[Path, ...]
+    missed: tuple[Skipped, ...]
+
+
+def search(
+    ik: IK,
+    steps: Sequence[Step],
+    method: str,
+    options: KeyframeOptions,
+    *,
+    lap: Callable[[str], None],
+    report: Callable[[str, float, str], None],
+) -> Found:
+    """Plan all steps in order.
+
+    Args:
+        ik: Workspace.
+        steps: Of the demonstration.
+        method: Key of `METHODS`.
+        options: Of the posture optimisation.
+        lap: Called with the stage that has just ended, for timing.
+        report: Called with stage, share and note, for progress.
+    """
+    keyframes = [standing(ik, options)]
+    paths: list[Path] = []
+    missed: list[Skipped] = []
+    steps = list(steps)
+    done: list[int] = []  # the step that each path makes
+    repairs = k = 0
+    while k < len(steps):
+        step = steps[k]
+        report("plan", k / len(steps), str(step.move))
+        result = plan_step(ik, keyframes[-1], step, method, options, lap)
+        if not isinstance(result, str):
+            keyframes.append(result[0])
+            paths.append(result[1])
+            done.append(k)
+            k += 1
+            continue
+        better = None
+        if repairs < MAX_REPAIRS:
+            better = repair(ik, keyframes, paths, step.move)
+            lap("repairs")
+        if better is None:
+            missed.append(Skipped(stance=step.stance, reason=result))
+            k += 1
+            continue
+        repairs += 1
+        j, contact = better
+        k = done[j]
+        del keyframes[j + 1 :], paths[j:], done[j:]
+        missed = [m for m in missed if m.stance <= steps[k].stance]
+        firm = replace(steps[k].move, makes=contact, firm=True)
+        steps[k] = replace(steps[k], move=firm)
+    return Found(keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed))
+
+
+def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
+    """The first keyframe: both feet where the robot starts."""
+    world, kin = ik.world, ik.kin
+    kin.update(world.home)
+    up = world.supports[GROUND].normal
+    feet = []
+    for limb in world.robot.limbs.values():
+        if limb.is_arm:
+            continue
+        surface = limb.surfaces[0]
+        s = world.surfaces[surface]
+        p = kin.contact_point(surface, up)
+        R = kin.rotation(s.body) @ (s.rotation if s.rotation is not None else np.eye(3))
+        p = p - up * (p @ up)
+        R = support_rotation(world.supports[GROUND], quat_from_matrix(R))
+        feet.append(
+            Contact(
+                surface=surface,
+                support=GROUND,
+                position=p,
+                quaternion=quat_from_matrix(R),
+            )
+        )
+    task = KeyframeTask(held=tuple(feet), new=(), q_reference=world.home)
+    return finish(
+        ik,
+        task,
+        options,
+        world.home,
+        method="home",
+        iterations=0,
+        cost_before=0.0,
+    )
+
+
+def repair(
+    ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
+) -> tuple[int, Contact] | None:
+    """Which earlier path should have made its contact elsewhere for `move` to work.
+
+    Looks at the last contact first.
+
+    Returns:
+        Index of the path, and the contact at its better place; None where none helps.
+    """
+    standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
+    for j in range(len(paths) - 1, -1, -1):
+        made = paths[j].transition.move.makes
+        if made is None or made.surface not in standing_on:
+            continue
+        standing_on.discard(made.surface)
+        contact = eased_contact(ik, keyframes[-1], move, made.surface)
+        if (
+            contact is not None
+            and np.linalg.norm(contact.position - made.position) > MOVED
+        ):
+            return j, contact
+    return None
+
+
+def plan_step(
+    ik: IK,
+    before: Keyframe,
+    step: Step,
+    method: str,
+    options: KeyframeOptions,
+    lap: Callable[[str], None],
+) -> tuple[Keyframe, Path] | str:
+    """The next keyframe and the path to it, or why there is none."""
+    move = step.move
+    held = tuple(c for c in before.stance if c.surface not in move.breaks)
+    if not held:
+        return f"{move}: nothing else bears load"
+    task = KeyframeTask(
+        held=held,
+        new=(move.makes,) if move.makes else (),
+        q_reference=before.q,
+        directions=step.target.posture,
+    )
+    if move.firm and move.makes:
+        key = _keyframe_there(ik, task, move.makes, before.q, method, options)
+    else:
+        key = METHODS[method](ik, task, before.q, options)
+    lap("keyframes")
+    transition = plan_transition(ik, before, key, move)
+    solved = key.status is transition.status is Status.SOLVED
+    if move.makes and not solved:
+        # Put the contact where the unloaded robot reaches it, and optimise around that.
+        wanted = next(c for c in key.stance if c.surface == move.makes.surface)
+        there = _keyframe_there(ik, task, wanted, transition.shifted, method, options)
+        key = replace(
+            there,
+            cost_before=key.cost_before,
+            iterations=key.iterations + there.iterations,
+        )
+        transition = plan_transition(ik, before, key, move)
+    lap("transitions")
+    for status in (key.status, transition.status):
+        if status is not Status.SOLVED:
+            return f"{move}: {status.value}"
+    path = plan_path(ik, transition)
+    lap("paths")
+    if path.status is not Status.SOLVED:
+        return f"{move}: {path.note or path.status.value}"
+    return key, path
+
+
+def _keyframe_there(
+    ik: IK,
+    task: KeyframeTask,
+    wanted: Contact,
+    q: np.ndarray,
+    method: str,
+    options: KeyframeOptions,
+) -> Keyframe:
+    """A stable posture with the new contact at, or nearest to, a given place."""
+    contact, solution = approach_contact(ik, task.held, wanted, q)
+    fixed = replace(task, new=(contact,), fixed=True)
+    key = direct.optimise(ik, fixed, solution.q, options)
+    return replace(key, method=method)

@@ -1,0 +1,839 @@
+"""Pictures, plots and a video of a run: to look at, never to compute with.
+
+Pictures come from MuJoCo's own renderer without a screen: EGL where there is one, else
+OSMesa. What is drawn depends on the records alone; the same run gives the same picture.
+
+Shapes: T samples, M recorded states, nS surfaces.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
+from clamber.contact import Contact, ContactSequence
+from clamber.demo import Demonstration
+from clamber.errors import ClamberError
+from clamber.io import ROLLOUT, load_plan, load_rollout, whole_file
+from clamber.model import Kinematics, Robot, World
+from clamber.pipeline import Plan
+from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
+from clamber.scene import GROUND, Scene, Support
+from clamber.simulation import Rollout
+from clamber.statics import com_margin, projected_distance, support_polygon, theta_max
+
+AZIMUTH, ELEVATION = 288.0, -17.0  # [deg] from the left, a little behind: the box hides
+# neither the feet on the ground nor the hands on its top
+MARGIN = 0.08  # share of the picture left free around what must be seen
+EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
+LOADED = 0.01  # [weights] a surface that bears more is loaded
+TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
+SAMPLES = 400  # of a plot over time
+FPS = 25
+VIDEO_SIZE = (640, 480)
+VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
+SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
+
+PHASE_COLOURS = {
+    "supporting": (0.10, 0.60, 0.25, 1.0),
+    "reach-to-supportable": (0.95, 0.75, 0.10, 1.0),
+    "sliding": (0.85, 0.10, 0.15, 1.0),
+}
+DARK, PALE, LINE = (35, 40, 48), (248, 249, 250), (205, 209, 214)
+SURFACE_COLOURS = ("#c2410c", "#1d4ed8")  # of a limb's surfaces, the outer one first
+Report = Callable[[str, float, str], None]
+
+
+# Drawing without a screen.
+
+_PROBE = (
+    "import mujoco; c = mujoco.GLContext(8, 8); c.make_current(); "
+    "mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
+)
+
+
+@functools.cache
+def gl_backend() -> str | None:
+    """`egl` or `osmesa`, whichever draws here; that of MUJOCO_GL alone where it is set.
+
+    Tried out in a process of its own: a library that fails to load, or crashes, would
+    spoil the next attempt in this one.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    candidates = (wanted,) if wanted else ("egl", "osmesa")
+    if sys.platform != "linux":
+        candidates = ("",)
+    for name in candidates:
+        environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
+        trial = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment | {"MUJOCO_GL": name},
+            capture_output=True,
+            check=False,
+        )
+        if trial.returncode == 0:
+            return name
+    return None
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """An OpenGL context of the backend that works.
+
+    Raises:
+        ClamberError: There is none.
+    """
+    backend = gl_backend()
+    if backend is None:
+        raise ClamberError(
+            "pictures need OpenGL without a screen and there is none: "
+            "`apt-get install libegl1 libgl1-mesa-dri` (or libosmesa6) brings it; "
+            "plots, plan and physics do without"
+        )
+    if backend == "egl":
+        from mujoco.egl import GLContext
+    elif backend == "osmesa":
+        from mujoco.osmesa import GLContext
+    else:
+        from mujoco import GLContext
+    return GLContext(width, height)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """A camera: what it looks at [m], from how far [m] and from where [deg]."""
+
+    lookat: np.ndarray
+    distance: float
+    azimuth: float
+    elevation: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disc:
+    """A mark that lies on a support."""
+
+    centre: np.ndarray
+    normal: np.ndarray
+    radius: float
+    colour: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rod:
+    """A mark from one point to another; an arrow where it has a head."""
+
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+    colour: tuple[float, float, float, float]
+    head: bool = False
+
+
+class Camera:
+    """Draws configurations of a world; a context manager, since OpenGL needs closing."""
+
+    def __init__(
+        self, world: World, size: tuple[int, int], *, smooth: bool = True
+    ) -> None:
+        """Open a context.
+
+        Args:
+            world: What to draw.
+            size: Width and height in pixels.
+            smooth: Edges are smoothed; costs three times the time in software.
+        """
+        self._gl: Any = None
+        self._context: Any = None
+        width, height = size
+        model = copy.copy(world.model)  # looks are set here, the world's stay
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.quality.offsamples = 4 if smooth else 0
+        model.vis.quality.shadowsize = 2048
+        model.vis.quality.numquads = 1
+        self._model, self._data = model, mujoco.MjData(model)
+        self._gl = _gl_context(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(
+            model, mujoco.mjtFontScale.mjFONTSCALE_100.value
+        )
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 200)
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.zeros((height, width, 3), dtype=np.uint8)
+
+    def __enter__(self) -> Camera:
+        """Itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Free the context."""
+        if self._context is not None:
+            self._context.free()
+        if self._gl is not None:
+            self._gl.free()
+
+    def shot(
+        self, q: np.ndarray, view: View, marks: Sequence[Disc | Rod] = ()
+    ) -> Image.Image:
+        """A picture of the configuration `q` (nq,)."""
+        self._data.qpos[:] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._camera.lookat[:] = view.lookat
+        self._camera.distance = view.distance
+        self._camera.azimuth, self._camera.elevation = view.azimuth, view.elevation
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        for mark in marks:
+            self._add(mark)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+        return Image.fromarray(self._pixels[::-1])
+
+    def _add(self, mark: Disc | Rod) -> None:
+        if self._scene.ngeom >= self._scene.maxgeom:
+            return
+        g = self._scene.geoms[self._scene.ngeom]
+        colour = np.array(mark.colour, dtype=np.float32)
+        if isinstance(mark, Disc):
+            kind, rod = mujoco.mjtGeom.mjGEOM_CYLINDER, None
+            radius, tip = mark.radius, mark.centre + 0.003 * mark.normal
+            rod = (mark.centre - 0.001 * mark.normal, tip)
+        else:
+            kind = mujoco.mjtGeom.mjGEOM_ARROW if mark.head else None
+            kind = mujoco.mjtGeom.mjGEOM_CAPSULE if kind is None else kind
+            radius, rod = mark.radius, (mark.start, mark.end)
+        mujoco.mjv_initGeom(
+            g, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour
+        )
+        mujoco.mjv_connector(g, kind, radius, *rod)
+        g.category = mujoco.mjtCatBit.mjCAT_DECOR.value
+        self._scene.ngeom += 1
+
+
+def frame_view(
+    points: np.ndarray, aspect: float, *, yaw: float = 0.0, fovy: float = 45.0
+) -> View:
+    """The nearest view that has all of the points (N, 3) in the picture.
+
+    With camera axes r (right), u (up), f (forward) and the picture's half widths t_r,
+    t_u at unit depth, a point p is seen from P where |(p - P) r| <= t_r (p - P) f, and
+    likewise for u: linear in P, and solved for the P farthest forward.
+
+    Args:
+        points: [m] in the world.
+        aspect: Width over height of the picture.
+        yaw: Way the robot faces at its start [rad].
+        fovy: Vertical field of view [deg].
+    """
+    azimuth = AZIMUTH + math.degrees(yaw)
+    a, e = math.radians(azimuth), math.radians(ELEVATION)
+    forward = np.array(
+        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
+    )
+    right = np.array([math.sin(a), -math.cos(a), 0.0])
+    up = np.cross(right, forward)
+    depth = points @ forward
+    half = math.tan(math.radians(fovy) / 2) * (1 - MARGIN)
+    ends, nearest = [], math.inf
+    for axis, t in ((right, half * aspect), (up, half)):
+        x = points @ axis
+        low, high = float(np.max(x - t * depth)), float(np.min(x + t * depth))
+        ends.append((low + high) / 2)
+        nearest = min(nearest, (high - low) / (2 * t))
+    distance = float(depth.mean()) - nearest
+    position = ends[0] * right + ends[1] * up + nearest * forward
+    return View(
+        lookat=position + distance * forward,
+        distance=distance,
+        azimuth=azimuth,
+        elevation=ELEVATION,
+    )
+
+
+def robot_corners(kin: Kinematics) -> np.ndarray:
+    """(8 G, 3) corners of the boxes around the robot's geoms, in the world [m]."""
+    m, d = kin.world.model, kin.data
+    own = np.flatnonzero(m.body_rootid[m.geom_bodyid] == m.body_rootid[kin.world.base])
+    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(8, 3)
+    local = m.geom_aabb[own, None, :3] + signs * m.geom_aabb[own, None, 3:]
+    R = d.geom_xmat[own].reshape(-1, 3, 3)
+    return (np.einsum("gij,gkj->gki", R, local) + d.geom_xpos[own, None]).reshape(-1, 3)
+
+
+def view_of(world: World, postures: Iterable[np.ndarray], aspect: float) -> View:
+    """A view with the robot in all postures, and the near edge of the first box."""
+    kin = Kinematics(world)
+    points = []
+    for q in postures:
+        kin.update(q)
+        points.append(robot_corners(kin))
+    points += [near_edge_points(world.scene)]
+    fovy = float(world.model.vis.global_.fovy)
+    seen = np.concatenate(points)
+    return frame_view(seen, aspect, yaw=float(world.scene.start[2]), fovy=fovy)
+
+
+def near_edge_points(scene: Scene) -> np.ndarray:
+    """(n, 3) where the first box's top begins, seen from the start, and below it."""
+    if not scene.boxes:
+        return np.zeros((0, 3))
+    top = scene.boxes[0].top
+    start = np.array([*scene.start[:2], 0.0])
+    A, b = top.edges()
+    facing = int(np.argmax(A @ start - b))
+    corners = top.position + top.polygon @ top.rotation[:, :2].T
+    c, d = corners[facing], corners[(facing + 1) % len(corners)]
+    way = (d - c) / np.linalg.norm(d - c)
+    foot = float(np.clip((start - c) @ way, 0.0, np.linalg.norm(d - c)))
+    span = np.clip([foot - EDGE_SHOWN, foot + EDGE_SHOWN], 0, np.linalg.norm(d - c))
+    edge = c + span[:, None] * way
+    return np.concatenate([edge, edge * [1.0, 1.0, 0.0]])
+
+
+# Sheets of pictures.
+
+
+def keyframe_sheet(
+    plan: Plan, path: str | Path, *, tile: tuple[int, int] = (400, 330)
+) -> Path:
+    """Draw each keyframe with its contacts, forces and margins.
+
+    A disc lies under each contact: green while supporting, yellow within reach of it, red
+    sliding. Arrows are the contact forces, 0.3 m for the robot's weight; a thin line
+    falls from the centre of mass.
+    """
+    world = plan.world
+    postures = [k.q for k in plan.keyframes]
+    view = view_of(world, postures, tile[0] / tile[1])
+    tiles = []
+    with Camera(world, tile) as camera:
+        for i, key in enumerate(plan.keyframes):
+            before = plan.keyframes[i - 1] if i else None
+            tiles.append(
+                (camera.shot(key.q, view, keyframe_marks(world, key)),
+                 keyframe_caption(i, key, before))
+            )  # fmt: skip
+    return _save_sheet(tiles, path, columns=min(4, len(tiles)))
+
+
+def keyframe_marks(world: World, key: Keyframe) -> list[Disc | Rod]:
+    """Discs, force arrows and the plumb line of a keyframe."""
+    marks: list[Disc | Rod] = []
+    forces = _force_by_contact(world, key)
+    weight = world.mass * 9.81
+    for state, force in zip(key.contacts, forces, strict=True):
+        c, colour = state.contact, PHASE_COLOURS[state.phase]
+        normal = world.supports[c.support].normal
+        marks.append(
+            Disc(centre=c.position, normal=normal, radius=0.045, colour=colour)
+        )
+        if np.linalg.norm(force) > LOADED * weight:
+            end = c.position + 0.3 / weight * force
+            marks.append(
+                Rod(start=c.position, end=end, radius=0.008, colour=colour, head=True)
+            )
+    floor = max(
+        (s.position[2] for s in world.supports.values() if s.inside(key.com)), default=0
+    )
+    foot = np.array([*key.com[:2], floor])
+    marks.append(Rod(start=key.com, end=foot, radius=0.004, colour=(0.1, 0.1, 0.1, 1)))
+    marks.append(
+        Disc(centre=foot, normal=np.array([0, 0, 1.0]), radius=0.02,
+             colour=(0.1, 0.1, 0.1, 1))
+    )  # fmt: skip
+    return marks
+
+
+def _force_by_contact(world: World, key: Keyframe) -> list[np.ndarray]:
+    """(3,) [N] for each contact, summed over its bearing points; zeros where unknown."""
+    kin = Kinematics(world)
+    kin.update(key.q)
+    counts = []
+    for c in key.stance:
+        normal = world.supports[c.support].normal
+        counts.append(len(kin.bearing_points(c.surface, normal, c.edge)))
+    if sum(counts) != len(key.equilibrium.forces):
+        return [np.zeros(3)] * len(counts)
+    ends = np.cumsum([0, *counts])
+    return [
+        key.equilibrium.forces[a:b].sum(axis=0)
+        for a, b in zip(ends, ends[1:], strict=False)
+    ]
+
+
+def describe_move(before: Sequence[Contact], after: Sequence[Contact]) -> str:
+    """What changed between two stances, such as `LElbow on box for LHand`."""
+    was = {c.surface: c for c in before}
+    now = {c.surface: c for c in after}
+    made = [
+        s
+        for s, c in now.items()
+        if s not in was or np.linalg.norm(c.position - was[s].position) > 0.01
+    ]
+    broken = [s for s in was if s not in now]
+    if made:
+        text = ", ".join(f"{s} on {now[s].support}" for s in made)
+        return f"{text} for {', '.join(broken)}" if broken else text
+    return f"{', '.join(broken)} in the air" if broken else "no change"
+
+
+def keyframe_caption(i: int, key: Keyframe, before: Keyframe | None) -> list[str]:
+    """Three lines: the move, geometry and balance, forces."""
+    if before is None:
+        title = "start, on " + ", ".join(c.surface for c in key.stance)
+        new = {c.surface for c in key.stance}
+    else:
+        title = describe_move(before.stance, key.stance)
+        old = {c.surface: c.position for c in before.stance}
+        new = {
+            c.surface
+            for c in key.stance
+            if c.surface not in old
+            or np.linalg.norm(c.position - old[c.surface]) > 0.01
+        }
+    d = ", ".join(
+        f"d {c.contact.surface} {1000 * c.projected_distance:.0f} mm"
+        for c in key.contacts
+        if c.contact.surface in new
+    )
+    e = key.equilibrium
+    push = f"holds a push of {e.margin:.2f} weights" if e.feasible else "cannot hold"
+    limit = f", limit {e.limiting}" if e.limiting else ""
+    return [
+        f"{i}  {title}",
+        f"{d + '; ' if d else ''}CoM margin {1000 * key.com_margin:.0f} mm",
+        push + limit,
+    ]
+
+
+def climb_sheet(
+    plan: Plan,
+    rollout: Rollout,
+    path: str | Path,
+    *,
+    frames: int = 12,
+    tile: tuple[int, int] = (300, 250),
+) -> Path:
+    """Draw what physics did, in pictures evenly spaced in time."""
+    rows = np.linspace(0, len(rollout.time) - 1, frames).round().astype(int)
+    view = view_of(plan.world, _some(rollout.qpos, 60), tile[0] / tile[1])
+    tiles = []
+    with Camera(plan.world, tile) as camera:
+        for row in rows:
+            picture = camera.shot(rollout.qpos[row], view)
+            tiles.append((picture, [f"{rollout.time[row]:.1f} s"]))
+    return _save_sheet(tiles, path, columns=4, colours=200)
+
+
+def _some(x: np.ndarray, n: int) -> np.ndarray:
+    """About `n` rows, evenly spaced, the last one among them."""
+    return x[np.unique(np.linspace(0, len(x) - 1, min(n, len(x))).round().astype(int))]
+
+
+@functools.cache
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size=size)
+
+
+def _save_sheet(
+    tiles: Sequence[tuple[Image.Image, list[str]]],
+    path: str | Path,
+    *,
+    columns: int,
+    colours: int | None = None,
+    gap: int = 6,
+) -> Path:
+    """Tiles in rows, each over its caption; with a palette where the file is to be small."""
+    width, height = tiles[0][0].size
+    lines = max(len(c) for _, c in tiles)
+    band = 8 + 18 * lines
+    rows = -(-len(tiles) // columns)
+    size = (columns * (width + gap) + gap, rows * (height + band + gap) + gap)
+    sheet = Image.new("RGB", size, PALE)
+    draw = ImageDraw.Draw(sheet)
+    for i, (picture, caption) in enumerate(tiles):
+        row, column = divmod(i, columns)
+        x, y = gap + column * (width + gap), gap + row * (height + band + gap)
+        sheet.paste(picture, (x, y))
+        draw.rectangle((x, y, x + width - 1, y + height + band - 1), outline=LINE)
+        for k, text in enumerate(caption):
+            at = (x + 7, y + height + 4 + 18 * k)
+            draw.text(at, text, font=_font(15 if k == 0 else 13), fill=DARK)
+    if colours is not None:
+        sheet = sheet.quantize(colours, dither=Image.Dither.NONE)
+    path = Path(path)
+    with whole_file(path) as draft:
+        sheet.save(draft, optimize=True)
+    return path
+
+
+# Plots over time.
+
+
+def demonstration_plot(
+    demonstration: Demonstration, sequence: ContactSequence, path: str | Path
+) -> Path:
+    """Heights of the person's parts over time, what was found to be contact in bold."""
+    t = demonstration.t
+    tracks = {p: demonstration.point(p)[:, 2] for p in _PARTS.values() for p in p}
+    contact = {
+        p: [(x.t0, x.t1) for x in sequence.intervals if x.part == p] for p in tracks
+    }
+    fig = _height_figure(t, tracks, contact, _PARTS, sequence.scene)
+    fig.suptitle(f"The person: {sequence.source}", fontsize=10)
+    return _save_plot(fig, path)
+
+
+def contact_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
+    """Heights of the robot's surfaces in physics, bold where they bear load."""
+    world, kin = plan.world, Kinematics(plan.world)
+    rows = _some(np.arange(len(rollout.time)), SAMPLES)
+    up = np.array([0.0, 0.0, 1.0])
+    heights = np.zeros((len(rows), len(rollout.surfaces)))
+    for i, row in enumerate(rows):
+        kin.update(rollout.qpos[row])
+        heights[i] = [kin.contact_point(s, up)[2] for s in rollout.surfaces]
+    loaded = loaded_surfaces(world, rollout)
+    tracks = {s: heights[:, i] for i, s in enumerate(rollout.surfaces)}
+    contact = {
+        s: [(rollout.time[a], rollout.time[b - 1]) for a, b in _runs(loaded[:, i])]
+        for i, s in enumerate(rollout.surfaces)
+    }
+    panels = _limb_panels(world.robot)
+    fig = _height_figure(rollout.time[rows], tracks, contact, panels, world.scene)
+    fig.suptitle(f"{world.robot.name} in physics", fontsize=10)
+    return _save_plot(fig, path)
+
+
+_PARTS = {
+    "left arm": ("LHand", "LElbow"),
+    "right arm": ("RHand", "RElbow"),
+    "left leg": ("LFoot", "LKnee"),
+    "right leg": ("RFoot", "RKnee"),
+}
+
+
+def _limb_panels(robot: Robot) -> dict[str, tuple[str, ...]]:
+    return {n.replace("_", " "): limb.surfaces for n, limb in robot.limbs.items()}
+
+
+def loaded_surfaces(world: World, rollout: Rollout) -> np.ndarray:
+    """(M, nS) bool, which surfaces bear more than a hundredth of the weight."""
+    force = np.linalg.norm(rollout.contact_force, axis=2)
+    return force > LOADED * world.mass * 9.81
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Half-open ranges in which a boolean (M,) mask is true."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return list(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
+
+
+def _height_figure(
+    t: np.ndarray,
+    tracks: dict[str, np.ndarray],
+    contact: dict[str, list[tuple[float, float]]],
+    panels: dict[str, tuple[str, ...]],
+    scene: Scene,
+) -> Figure:
+    """One panel a limb: heights thin, contacts bold, tops of boxes dotted."""
+    fig = Figure(figsize=(10, 5.4), layout="constrained")
+    axes = fig.subplots(2, 2, sharex=True, sharey=True).ravel().tolist()
+    for ax, (limb, surfaces) in zip(axes, panels.items(), strict=True):
+        for box in scene.boxes:
+            ax.axhline(box.top.position[2], color="0.45", ls=":", lw=1)
+        ax.axhline(0.0, color="0.45", ls=":", lw=1)
+        for s, colour in zip(surfaces, SURFACE_COLOURS, strict=False):
+            ax.plot(t, tracks[s], color=colour, lw=0.9, alpha=0.8, label=s)
+            for t0, t1 in contact[s]:
+                inside = (t >= t0) & (t <= t1)
+                ax.plot(t[inside], tracks[s][inside], color=colour, lw=3.5)
+        ax.set_title(limb, fontsize=9, loc="left")
+        _finish_axes(ax)
+    for ax in axes[2:]:
+        ax.set_xlabel("time [s]")
+    for ax in axes[::2]:
+        ax.set_ylabel("height [m]")
+    return fig
+
+
+def _finish_axes(ax: Axes) -> None:
+    ax.legend(fontsize=8, frameon=False, loc="upper right")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(labelsize=8)
+
+
+def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
+    """Projected distances of loaded contacts and the CoM's margin, with their limits."""
+    world = plan.world
+    rows = _some(np.arange(len(rollout.time)), SAMPLES)
+    t = rollout.time[rows]
+    d, limit, margin = stability_over_time(world, rollout, rows)
+    fig = Figure(figsize=(10, 7.2), layout="constrained")
+    grid = fig.add_gridspec(3, 2)
+    index = {s: i for i, s in enumerate(rollout.surfaces)}
+    for k, (limb, surfaces) in enumerate(_limb_panels(world.robot).items()):
+        ax = fig.add_subplot(grid[k // 2, k % 2])
+        for s, colour in zip(surfaces, SURFACE_COLOURS, strict=False):
+            ax.plot(t, d[:, index[s]], color=colour, lw=1.4, label=s)
+            ax.plot(t, limit[:, index[s]], color=colour, lw=0.9, ls="--")
+        top = "supported mass: shoulder" if "arm" in limb else "supported mass: hip"
+        ax.set_title(f"{limb} ({top})", fontsize=9, loc="left")
+        ax.set_xlim(t[0], t[-1])
+        ax.set_ylim(0.0, 1.05 * max(0.1, float(np.nanmax(np.append(limit, d)))))
+        ax.set_ylabel("d [m]; dashed: limit", fontsize=8)
+        _finish_axes(ax)
+    ax = fig.add_subplot(grid[2, :])
+    ax.plot(t, margin, color="0.15", lw=1.2, label="CoM inside the support polygon")
+    ax.axhline(0.0, color="#b91c1c", lw=1, ls="--", label="its border")
+    wanted = plan.options.keyframe.balance_margin
+    ax.axhline(wanted, color="#15803d", lw=1, ls="--", label="asked of keyframes")
+    ax.set_xlim(t[0], t[-1])
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel("margin [m]", fontsize=8)
+    _finish_axes(ax)
+    return _save_plot(fig, path)
+
+
+def stability_over_time(
+    world: World, rollout: Rollout, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geometric stability (4.17) of what physics did.
+
+    Returns:
+        d: (n, nS) projected distances [m], NaN where a surface is not loaded.
+        limit: (n, nS) l sin(theta_max) in the present posture [m].
+        margin: (n,) of the centre of mass [m], NaN where nothing is loaded.
+    """
+    kin = Kinematics(world)
+    loaded = loaded_surfaces(world, rollout)[rows]
+    d = np.full(loaded.shape, np.nan)
+    limit, margin = d.copy(), np.full(len(rows), np.nan)
+    for i, row in enumerate(rows):
+        kin.update(rollout.qpos[row])
+        bearing = []
+        for j in np.flatnonzero(loaded[i]):
+            surface = rollout.surfaces[j]
+            support = support_below(world, kin, surface)
+            point = kin.contact_point(surface, support.normal)
+            mass = kin.landmark(world.robot.limb_of(surface).root)[1]
+            d[i, j] = projected_distance(point, mass)
+            length = float(np.linalg.norm(mass - point))
+            limit[i, j] = length * math.sin(theta_max(support.friction))
+            points = kin.bearing_points(surface, support.normal)
+            gaps = support.height(points)
+            bearing.append(points[gaps <= max(TOUCHING, float(gaps.min()))])
+        if bearing:
+            polygon = support_polygon(np.concatenate(bearing)[:, :2])
+            margin[i] = com_margin(kin.com, polygon)
+    return d, limit, margin
+
+
+def support_below(world: World, kin: Kinematics, surface: str) -> Support:
+    """The support that a surface is nearest to at the present posture."""
+
+    def gap(s: Support) -> float:
+        point = kin.contact_point(surface, s.normal)
+        outside = 0.0 if s.inside(point, -0.05) else math.inf
+        return abs(float(s.height(point))) + outside
+
+    return min(world.supports.values(), key=gap)
+
+
+def cost_shapes(path: str | Path) -> Path:
+    """Cost of one contact along x: the norm, and the weighted norm with w = 5 (4.25)."""
+    x = np.linspace(-0.5, 0.5, 401)
+    fig = Figure(figsize=(6, 3.6), layout="constrained")
+    ax = fig.subplots()
+    ax.plot(
+        x, STABILITY_WEIGHT * np.abs(x), color="#1d4ed8", label="weighted norm, w = 5"
+    )
+    ax.plot(x, np.abs(x), color="#b91c1c", label="norm")
+    ax.plot(
+        x,
+        STABILITY_WEIGHT * x**2,
+        color="0.4",
+        ls="--",
+        lw=1,
+        label="w times its square",
+    )
+    ax.set_xlabel("contact against the projection of its supported mass, x [m]")
+    ax.set_ylabel("cost")
+    _finish_axes(ax)
+    ax.legend(fontsize=8, frameon=False, loc="upper center")
+    return _save_plot(fig, path)
+
+
+def _save_plot(fig: Figure, path: str | Path) -> Path:
+    path = Path(path)
+    with whole_file(path) as draft:
+        fig.savefig(draft, dpi=110, metadata={"Software": None})
+    return path
+
+
+# Video.
+
+
+def speedup_of(duration: float) -> int:
+    """How much faster than it was a run of that many seconds is shown."""
+    speedup = 1
+    while duration > SPEEDUP_AFTER and duration / speedup > VIDEO_SECONDS:
+        speedup *= 2
+    return speedup
+
+
+def video(
+    plan: Plan, rollout: Rollout, folder: str | Path, *, report: Report | None = None
+) -> Path:
+    """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg."""
+    folder = Path(folder)
+    if importlib.util.find_spec("imageio_ffmpeg"):
+        path, fps, size = folder / "video.mp4", FPS, VIDEO_SIZE
+    else:
+        path, fps, size = folder / "video.webp", FPS / 2, (480, 360)
+    frames = _frames(
+        plan, rollout, fps, size, report or (lambda stage, share, note: None)
+    )
+    with whole_file(path) as draft:
+        if path.suffix == ".mp4":
+            _write_mp4(frames, draft, size)
+        else:
+            first, *rest = frames
+            options: dict[str, Any] = {"quality": 70, "method": 0, "loop": 0}
+            first.save(
+                draft,
+                save_all=True,
+                append_images=rest,
+                duration=round(1000 / fps),
+                **options,
+            )
+    return path
+
+
+def _frames(
+    plan: Plan, rollout: Rollout, fps: float, size: tuple[int, int], report: Report
+) -> Iterator[Image.Image]:
+    """Pictures of the rollout with its clock and the move under way."""
+    duration = float(rollout.time[-1])
+    speedup = speedup_of(duration)
+    times = np.arange(0.0, duration, speedup / fps)
+    rows = np.searchsorted(rollout.time, times)
+    moves = _move_names(plan)
+    starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
+    drawn = (size[0] * 3 // 2, size[1] * 3 // 2)  # smoother edges at half the price
+    view = view_of(plan.world, _some(rollout.qpos, 60), size[0] / size[1])
+    with Camera(plan.world, drawn, smooth=False) as camera:
+        for i, (row, t) in enumerate(zip(rows, times, strict=True)):
+            if i % 10 == 0:
+                report("video", i / len(rows), "")
+            picture = camera.shot(rollout.qpos[row], view)
+            picture = picture.resize(size, Image.Resampling.BOX)
+            move = int(np.searchsorted(starts, t, side="right"))
+            text = moves[move - 1] if 1 <= move <= len(moves) else "done"
+            clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
+            draw = ImageDraw.Draw(picture)
+            draw.text((12, size[1] - 28), clock, font=_font(18), fill=DARK)
+            at = (size[0] - 12, size[1] - 28)
+            draw.text(at, text, font=_font(18), fill=DARK, anchor="ra")
+            yield picture
+    report("video", 1.0, "")
+
+
+def _move_names(plan: Plan) -> list[str]:
+    keys = plan.keyframes
+    return [
+        describe_move(a.stance, b.stance) for a, b in zip(keys, keys[1:], strict=False)
+    ]
+
+
+def _write_mp4(
+    frames: Iterable[Image.Image], path: Path, size: tuple[int, int]
+) -> None:
+    import imageio_ffmpeg
+
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        size,
+        fps=FPS,
+        codec="libx264",
+        quality=None,
+        macro_block_size=2,
+        output_params=[
+            "-crf", "24", "-preset", "veryfast", "-movflags", "+faststart",
+            "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
+        ],
+    )  # fmt: skip
+    writer.send(None)
+    try:
+        for frame in frames:
+            writer.send(frame.tobytes())
+    finally:
+        writer.close()
+
+
+# A whole run.
+
+
+def render_run(
+    folder: str | Path,
+    *,
+    with_video: bool = True,
+    demonstration: tuple[Demonstration, ContactSequence] | None = None,
+    report: Report | None = None,
+) -> list[Path]:
+    """Draw all there is to draw of a run folder, plots first.
+
+    Args:
+        folder: With a plan; with a rollout there is more to see.
+        with_video: Also the video, which takes the longest.
+        demonstration: The recording and what was found in it.
+        report: Told of stage, share done and a note.
+
+    Raises:
+        InputError: A file of the folder is missing or broken.
+        ClamberError: There is no OpenGL for pictures; the plots are done by then.
+    """
+    folder = Path(folder)
+    tell = report or (lambda stage, share, note: None)
+    plan = load_plan(folder)
+    rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
+    files: list[Path] = []
+    tell("pictures", 0.0, "plots")
+    if demonstration is not None:
+        files.append(demonstration_plot(*demonstration, folder / "demonstration.png"))
+    if rollout is not None:
+        files.append(contact_plot(plan, rollout, folder / "contacts.png"))
+        files.append(stability_plot(plan, rollout, folder / "stability.png"))
+    tell("pictures", 0.4, "keyframes")
+    files.append(keyframe_sheet(plan, folder / "keyframes.png"))
+    if rollout is not None:
+        tell("pictures", 0.7, "climb")
+        files.append(climb_sheet(plan, rollout, folder / "climb.png"))
+        tell("pictures", 1.0, "")
+        if with_video:
+            files.append(video(plan, rollout, folder, report=tell))
+    return files
