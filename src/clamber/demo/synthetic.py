@@ -273,7 +273,7 @@ def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
         "second hand": (0.14, 0, hips, 0.8, wrist - 0.21, 0, h + 0.50, 1.2, 0),
         "first elbow": (0.18, 0, hips, 0.9, wrist - 0.12, 0, h + 0.43, 1.4, 0.6),
         "second elbow": (0.21, 0, hips, 1.0, wrist - 0.10, 0, h + 0.32, 1.5, 0),
-        "first toe-off": (0.24, -0.04, hips, 1.0, wrist - 0.07, 0, h + 0.32, 1.5, 0),
+        "first toe-off": (0.19, -0.04, hips, 1.0, wrist - 0.07, 0, h + 0.32, 1.5, 0),
         "first knee": (0.29, -0.02, h + 0.37, 1.0, wrist - 0.04, 0, h + 0.31, 1.5, 0),
         "second toe-off": (
             0.31,
@@ -304,9 +304,9 @@ def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
 _FOOT_PITCH = {  # [rad] heels rise: (first side, second side) at the key poses
     "first elbow": (0.0, 0.0),
     "second elbow": (0.1, 0.1),
-    "first toe-off": (0.9, 0.15),
-    "first knee": (0.9, 0.75),
-    "second toe-off": (0.9, 1.15),
+    "first toe-off": (0.65, 0.15),
+    "first knee": (0.9, 0.6),
+    "second toe-off": (0.9, 0.9),
 }
 
 
@@ -548,7 +548,7 @@ def _leg(
     """Hip, knee and foot: stand, roll onto the toes, swing the knee onto the box."""
     off, on = f"{order} toe-off", f"{order} knee"
     hip = _joint(body, f"{s}Hip")
-    pole = np.array([1.0, 0.15 * _SIGN[s], 0.2])
+    pole = np.array([1.0, 0.4 * _SIGN[s], 0.2])
 
     def stand(
         hips: np.ndarray, angle: np.ndarray
@@ -562,7 +562,9 @@ def _leg(
     knee0, ankle0, toe0 = stand(left, key_pitch[[_KEY[off]]])
 
     goes = clock.part(off, on)
-    path = knee0 + (holds.knee[s] - knee0) * _hit(goes)[:, None]
+    share = np.stack([_hit((goes - 0.2) / 0.8)] * 2 + [_hit(goes)], axis=1)
+    path = knee0 + (holds.knee[s] - knee0) * share  # up before it goes forward
+    path[:, 1] += _SIGN[s] * 0.2 * _hop(goes)  # around the edge, rather than over it
     path[:, 2] += 0.28 * _hop(goes)
     swing = hip + THIGH * _unit(path - hip)
     swing[clock.since(on)] = holds.knee[s]

@@ -1,0 +1,454 @@
+"""Recordings are read as they are meant; what cannot be used is refused and named."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from clamber.demo import PARTS, ClimbOptions, Demonstration, load_demo, synthesize_climb
+from clamber.demo.boxes import read_obj_boxes
+from clamber.demo.demonstration import build_demonstration, runs
+from clamber.demo.skeleton import canonical_columns
+from clamber.errors import InputError
+from clamber.scene import Scene
+from clamber.se3 import matrix_from_rpy
+
+NAMES = [
+    "Hips",
+    *(side + n for side in ("Left", "Right")
+      for n in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")),
+]  # fmt: skip
+PLACE = {
+    "Hips": (0, 0, 0.907), "Arm": (0, 0.155, 1.43), "ForeArm": (0, 0.155, 1.119),
+    "Hand": (0, 0.155, 0.865), "UpLeg": (0, 0.0975, 0.906), "Leg": (0, 0.0975, 0.533),
+    "Foot": (0, 0.0975, 0.08), "ToeBase": (0.15, 0.0975, 0.035),
+}  # fmt: skip
+SEGMENTS = {
+    "thigh": ("Hip", "Knee", 0.373),
+    "shank": ("Knee", "Foot", 0.453),
+    "upper_arm": ("Shoulder", "Elbow", 0.311),
+    "forearm": ("Elbow", "Hand", 0.254),
+}
+
+
+def standing(samples: int = 60) -> np.ndarray:
+    """(T, F, 3) of a person who stands still at the origin and looks along x."""
+    out = np.zeros((samples, len(NAMES), 3))
+    for f, name in enumerate(NAMES):
+        side = next((s for s in ("Left", "Right") if name.startswith(s)), "")
+        x, y, z = PLACE[name.removeprefix(side)]
+        out[:, f] = [x, -y if side == "Right" else y, z]
+    return out
+
+
+def box_obj(size, centre, yaw, first: int = 1, name: str | None = None) -> str:
+    """Eight vertices of an upright box in an order of no meaning."""
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, 8).T * size
+    v = corners @ matrix_from_rpy([0, 0, yaw]).T + centre
+    v = v[np.random.default_rng(first).permutation(8)]
+    lines = [] if name is None else [f"o {name}"]
+    return "\n".join([*lines, *(f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in v), ""])
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a recording with these fields changed; None leaves a field out."""
+
+    def write(array: np.ndarray | None = None, **fields) -> Path:
+        np.save(tmp_path / "joints.npy", standing() if array is None else array)
+        (tmp_path / "names.json").write_text(json.dumps(NAMES))
+        said = {"file": "joints.npy", "names": "names.json", "rate": 30, **fields}
+        path = tmp_path / "recording.yaml"
+        path.write_text(
+            yaml.safe_dump({k: v for k, v in said.items() if v is not None})
+        )
+        return path
+
+    return write
+
+
+def test_a_recording_is_read_with_its_points_times_and_lengths(write):
+    demo = load_demo(write())
+    assert set(PARTS) <= set(demo.names)
+    assert demo.rate == pytest.approx(30.0)
+    assert not demo.synthetic
+    for segment, (_, _, length) in SEGMENTS.items():
+        assert demo.subject[segment] == pytest.approx(length, abs=1e-9)
+    assert demo.subject["knee_height"] == pytest.approx(0.533, abs=1e-9)
+    assert demo.subject["hip_height"] == pytest.approx(0.906, abs=1e-9)
+    np.testing.assert_allclose(demo.scene.start, [0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(demo.point("LElbow")[0], [0, 0.155, 1.119])
+    assert demo.points_of("LFoot") == ("LFoot", "LFoot.toe")
+
+
+def test_units_and_the_up_axis_are_brought_to_metres_and_z(write):
+    p = standing()
+    y_up = 1000.0 * np.stack([p[..., 0], p[..., 2], -p[..., 1]], axis=-1)
+    np.testing.assert_allclose(
+        load_demo(write(y_up, unit="mm", up="y")).position,
+        load_demo(write()).position,
+        atol=1e-9,
+    )
+
+
+def test_a_span_keeps_the_recordings_own_times(write):
+    moving = standing()
+    moving[:, :, 0] += np.arange(60)[:, None] / 30
+    demo = load_demo(write(moving, span=[0.5, 1.0]))
+    assert demo.t[0] == pytest.approx(0.5)
+    assert demo.t[-1] == pytest.approx(1.0)
+    assert demo.point("Pelvis")[0, 0] == pytest.approx(0.5)
+    assert demo.scene.start[0] == pytest.approx(0.5)
+
+
+def test_the_start_has_the_yaw_of_the_hips(write):
+    R = matrix_from_rpy([0, 0, 2.0])
+    start = load_demo(write(standing() @ R.T + [1.0, 2.0, 0.0])).scene.start
+    np.testing.assert_allclose(start, [1.0, 2.0, 2.0], atol=1e-9)
+
+
+def test_boxes_are_fitted_exactly_whatever_the_order_of_their_vertices(tmp_path, rng):
+    truth, text = [], ""
+    for k in range(6):
+        size, yaw = rng.uniform(0.2, 2.0, 3), rng.uniform(-np.pi, np.pi)
+        centre = np.array([*rng.uniform(-3, 3, 2), size[2] / 2])
+        truth.append((size, centre, yaw))
+        text += box_obj(size, centre, yaw, first=k)
+    (tmp_path / "b.obj").write_text(text)
+    boxes = read_obj_boxes(tmp_path / "b.obj")
+    assert [b.name for b in boxes] == [f"box{k}" for k in range(1, 7)]
+    for box, (size, centre, yaw) in zip(boxes, truth, strict=True):
+        np.testing.assert_allclose(box.position, centre, atol=1e-7)
+        np.testing.assert_allclose(box.top.height(centre), -size[2] / 2, atol=1e-7)
+        np.testing.assert_allclose(np.sort(box.size[:2]), np.sort(size[:2]), atol=1e-7)
+        R = matrix_from_rpy([0, 0, yaw])
+        for corner in ([1, 1], [1, -1], [-1, 1], [-1, -1]):
+            p = centre + R @ [*(np.array(corner) * size[:2] / 2), size[2] / 2]
+            assert box.top.inside(p, margin=-1e-6)
+            assert not box.top.inside(p, margin=1e-6)
+
+
+def test_objects_of_an_obj_give_boxes_their_names(tmp_path):
+    text = box_obj([1, 2, 0.5], [0, 0, 0.25], 0.3, name="step")
+    text += box_obj([1, 1, 1], [3, 0, 0.5], 0.0, name="table")
+    (tmp_path / "b.obj").write_text(text)
+    assert [b.name for b in read_obj_boxes(tmp_path / "b.obj")] == ["step", "table"]
+
+
+def test_a_box_that_is_the_ground_lowers_the_world_to_its_top(write, tmp_path):
+    (tmp_path / "b.obj").write_text(
+        box_obj([1, 1, 0.95], [1, 0, 0.475], 0.2)
+        + box_obj([1, 1, 0.47], [0, 0, 0.235], 0.1)
+        + box_obj([1, 1, 0.18], [-1, 0, 0.09], 0.0)
+    )
+    on_step = standing() + np.array([0, 0, 0.47])
+    floor = load_demo(write(on_step, boxes="b.obj"))
+    demo = load_demo(write(on_step, boxes="b.obj", ground="box2"))
+    assert [b.name for b in floor.scene.boxes] == ["box1", "box2", "box3"]
+    assert [b.name for b in demo.scene.boxes] == ["box1"]
+    box = demo.scene.boxes[0]
+    assert box.top.position[2] == pytest.approx(0.48, abs=1e-7)
+    assert box.position[2] - box.size[2] / 2 == pytest.approx(0.0, abs=1e-7)
+    assert demo.point("LFoot")[0, 2] == pytest.approx(0.08, abs=1e-7)
+    assert floor.subject["knee_height"] == pytest.approx(0.533, abs=1e-6)
+
+
+def test_short_gaps_are_filled_smoothly_and_long_ones_are_reported(write):
+    p = standing(120)
+    p[:, :, 0] += (np.linspace(0, 1, 120) ** 2)[:, None]
+    holed = p.copy()
+    elbow, knee = NAMES.index("LeftForeArm"), NAMES.index("RightLeg")
+    holed[40:45, elbow] = np.nan
+    holed[60:90, knee, 1] = np.nan
+    holed[:3, elbow] = np.nan
+    demo = load_demo(write(holed))
+    np.testing.assert_allclose(demo.point("LElbow")[40:45], p[40:45, elbow], atol=1e-3)
+    valid = dict(zip(demo.names, demo.valid.T, strict=True))
+    assert valid["LElbow"][3:].all()
+    assert not valid["LElbow"][:3].any()
+    assert not valid["RKnee"][60:90].any()
+    assert valid["RKnee"].sum() == 90
+    assert [(g.point, g.filled) for g in demo.gaps] == [
+        ("LElbow", False), ("LElbow", True), ("RKnee", False)
+    ]  # fmt: skip
+    assert (demo.gaps[2].t0, demo.gaps[2].t1) == pytest.approx((2.0, 89 / 30))
+    assert load_demo(write(holed, max_gap=1.5)).valid[60:90].all()
+
+
+def test_parts_name_points_that_are_not_recognised(write, tmp_path):
+    path = write(parts={"LHand": "glove", "RHand": ["RightHand", "RightToeBase"]})
+    names = ["glove" if n == "LeftHand" else n for n in NAMES]
+    (tmp_path / "names.json").write_text(json.dumps(names))
+    demo = load_demo(path)
+    np.testing.assert_allclose(demo.point("LHand")[0], [0, 0.155, 0.865])
+    assert demo.points_of("RHand") == ("RHand", "RHand.1")
+
+
+def test_a_finger_that_stands_for_the_hand_does_not_lengthen_the_forearm(write):
+    p = standing()
+    tip = p[:, NAMES.index("LeftHand")] + [0.16, 0, 0]
+    array = np.concatenate([p, tip[:, None]], axis=1)
+    path = write(array, names=[*NAMES, "LeftTip"], parts={"LHand": "LeftTip"})
+    demo = load_demo(path)
+    assert "LWrist" in demo.names
+    assert demo.subject["forearm"] == pytest.approx(0.254)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        NAMES,
+        ["pelvis", *(f"{s}_{n}" for s in ("left", "right") for n in (
+            "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "foot"))],
+        ["Pelvis", *(s + n for s in "LR" for n in (
+            "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle", "Toe"))],
+    ],
+    ids=["mixamo", "smpl", "short"],
+)  # fmt: skip
+def test_common_skeletons_are_recognised(names):
+    columns = canonical_columns(names, None, "test")
+    for s, k in (("L", 1), ("R", 8)):
+        order = ("Shoulder", "Elbow", "Hand", "Hip", "Knee", "Foot", "Foot.toe")
+        assert [columns[s + n] for n in order] == list(range(k, k + 7))
+    assert columns["Pelvis"] == 0
+
+
+WRONG = {
+    "unknown key": ({"speed": 3}, "speed"),
+    "rate": ({"rate": 0}, "rate"),
+    "no rate": ({"rate": None}, "rate"),
+    "no names": ({"names": None}, "names"),
+    "unit": ({"unit": "inch"}, "unit"),
+    "empty span": ({"span": [1.0, 1.0]}, "span"),
+    "late span": ({"span": [50.0, 60.0]}, "span"),
+    "missing file": ({"file": "none.npy"}, "none.npy"),
+    "missing names": ({"names": "none.json"}, "none.json"),
+    "too few names": ({"names": NAMES[:-1]}, "15 names"),
+    "a name twice": ({"names": [*NAMES[:-1], NAMES[0]]}, "different names"),
+    "missing joint": (
+        {"names": ["X" if n == "LeftLeg" else n for n in NAMES]},
+        "LKnee",
+    ),
+    "unknown ground": ({"ground": "sofa"}, "sofa"),
+    "missing boxes": ({"boxes": "none.obj"}, "none.obj"),
+    "part of nothing": ({"parts": {"LHand": "Nose"}}, "Nose"),
+    "unknown part": ({"parts": {"LTail": "LeftLeg"}}, "LTail"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_wrong_field_is_named(write, case):
+    fields, word = WRONG[case]
+    with pytest.raises(InputError, match=word) as e:
+        load_demo(write(**fields))
+    assert "\n" not in str(e.value)
+    assert "expected" in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("array", "word"),
+    [
+        (np.zeros((10, 15)), r"samples, points, 3"),
+        (np.zeros((0, 15, 3)), r"samples, points, 3"),
+        (np.full((30, 15, 3), np.nan), "not NaN"),
+        (np.full((30, 15, 3), "x"), "numbers"),
+        (1000.0 * standing(), "unit: mm"),
+        (100.0 * standing(), "unit: cm"),
+    ],
+    ids=["flat", "empty", "nan", "text", "millimetres", "centimetres"],
+)
+def test_a_wrong_array_is_refused_with_the_reason(write, array, word):
+    with pytest.raises(InputError, match=word):
+        load_demo(write(array))
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("", "8 vertices"),
+        ("v 0 0 0\n", "8 vertices"),
+        ("v 0 zero 0\n", "line 1"),
+        (box_obj([1, 1, 1], [0, 0, 0.5], 0.0).replace("0.5", "0.8", 1), "upright box"),
+    ],
+)
+def test_an_obj_of_no_boxes_is_refused(tmp_path, text, word):
+    (tmp_path / "b.obj").write_text(text)
+    with pytest.raises(InputError, match=word):
+        read_obj_boxes(tmp_path / "b.obj")
+
+
+@pytest.mark.parametrize("name", ["clmb", "recording.csv", "none.yaml", "none.npy"])
+def test_an_unknown_recording_is_refused(name):
+    with pytest.raises(InputError, match=name):
+        load_demo(name)
+
+
+def test_a_file_that_is_no_array_is_refused(tmp_path):
+    (tmp_path / "a.npy").write_bytes(b"no array")
+    with pytest.raises(InputError, match=r"a\.npy"):
+        load_demo(tmp_path / "a.npy", names=NAMES, rate=30)
+
+
+def test_bare_arrays_are_read_with_names_and_rate(tmp_path):
+    np.save(tmp_path / "a.npy", standing())
+    np.savez(tmp_path / "b.npz", positions=standing(), names=NAMES, rate=30.0)
+    a = load_demo(tmp_path / "a.npy", names=NAMES, rate=30.0)
+    b = load_demo(tmp_path / "b.npz")
+    np.testing.assert_array_equal(a.position, b.position)
+    np.testing.assert_array_equal(a.t, b.t)
+    with pytest.raises(InputError, match="rate"):
+        load_demo(tmp_path / "a.npy", names=NAMES)
+
+
+def test_a_demonstration_keeps_its_arrays(write):
+    demo = load_demo(write())
+    with pytest.raises(ValueError, match="read-only"):
+        demo.position[0, 0, 0] = 1.0
+    with pytest.raises(ValueError, match="increase"):
+        Demonstration(
+            source="x", t=demo.t[::-1], names=demo.names, position=demo.position,
+            valid=demo.valid, scene=demo.scene, subject={},
+        )  # fmt: skip
+
+
+def test_a_point_never_seen_is_dropped_unless_it_is_needed():
+    p = standing()
+    p[:, NAMES.index("LeftToeBase")] = np.nan
+    columns = canonical_columns(NAMES, None, "x")
+    demo = build_demonstration(
+        p[:, list(columns.values())], names=list(columns), rate=30.0,
+        scene=Scene(start=np.zeros(3)), source="x",
+    )  # fmt: skip
+    assert "LFoot.toe" not in demo.names
+    assert "RFoot.toe" in demo.names
+
+
+def test_runs_are_half_open_ranges():
+    assert runs(np.array([1, 0, 1, 1, 0, 1], dtype=bool)) == [(0, 1), (2, 4), (5, 6)]
+    assert runs(np.zeros(3, dtype=bool)) == []
+
+
+# The built-in climb.
+
+
+def clean(**options) -> tuple[Demonstration, list]:
+    options = ClimbOptions(noise=0.0, gaps=0, **options)
+    return synthesize_climb(np.random.default_rng(3), options=options)
+
+
+HEIGHTS = [0.57, 0.94, 1.12]
+
+
+@pytest.mark.parametrize("ratio", HEIGHTS)
+def test_limbs_of_the_built_in_climb_never_change_length(ratio):
+    demo, _ = clean(height_ratio=ratio)
+    for a, b, length in SEGMENTS.values():
+        for s in "LR":
+            d = np.linalg.norm(demo.point(s + a) - demo.point(s + b), axis=1)
+            np.testing.assert_allclose(d, length, atol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", HEIGHTS)
+def test_what_truly_touches_is_perfectly_still_in_the_clean_climb(ratio):
+    demo, truth = clean(height_ratio=ratio)
+    for i in truth:
+        held = (demo.t >= i.t0) & (demo.t <= i.t1)
+        point = "Foot.toe" if i.part.endswith("Foot") else i.part[1:]
+        p = demo.point(i.part[0] + point)[held]
+        assert np.ptp(p, axis=0).max() < 1e-6
+        height = demo.scene.support(i.contact.support).height(p)
+        assert np.all((height > 0.0) & (height < 0.12))
+
+
+@pytest.mark.parametrize("ratio", HEIGHTS)
+def test_no_limb_of_the_climb_goes_through_the_box(ratio):
+    demo, _ = clean(height_ratio=ratio)
+    box = demo.scene.boxes[0]
+    bones = [(s + a, s + b) for s in "LR" for a, b, _ in SEGMENTS.values()]
+    bones += [(s + "Foot", s + "Foot.toe") for s in "LR"] + [("Pelvis", "Neck")]
+    for a, b in bones:
+        for share in np.linspace(0.0, 1.0, 9):
+            p = (1 - share) * demo.point(a) + share * demo.point(b) - box.position
+            depth = np.min(box.size / 2 - np.abs(p @ box.rotation), axis=1)
+            assert depth.max() < -0.01, (a, b, demo.t[np.argmax(depth)])
+
+
+@pytest.mark.parametrize("ratio", HEIGHTS)
+def test_knees_and_ankles_bend_the_way_they_do(ratio):
+    demo, _ = clean(height_ratio=ratio)
+    left = demo.point("LHip") - demo.point("RHip")
+    for s in "LR":
+        hip, knee, ankle = (demo.point(s + n) for n in ("Hip", "Knee", "Foot"))
+        bend = np.sum(np.cross(knee - hip, ankle - knee) * left, axis=1)
+        assert bend.min() > -1e-3  # the shank turns back about the axis to the left
+        toe = demo.point(s + "Foot.toe") - ankle
+        assert np.sum(np.cross(ankle - knee, toe) * left, axis=1).max() < 0.02
+
+
+def test_the_climb_is_continuous():
+    demo, _ = clean()
+    steps = np.linalg.norm(np.diff(demo.position, axis=0), axis=2)
+    assert steps.max() * demo.rate < 3.0  # [m/s]; a jump of 3 cm would be 3.6
+
+
+def test_the_climb_shows_eight_contacts_in_the_asked_for_order():
+    demo, truth = clean()
+    table = [i.part for i in truth if i.contact.support == "table"]
+    assert table == ["LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee"]
+    off = {i.part: i.t1 for i in truth if i.contact.support == "ground"}
+    on = {i.part: i.t0 for i in truth}
+    assert on["RElbow"] < off["LFoot"] < on["LKnee"] < off["RFoot"] < on["RKnee"]
+    mirrored = clean(mirrored=True)[1]
+    assert next(i.part for i in mirrored if i.contact.support == "table") == "RHand"
+    assert 20.0 <= demo.t[-1] <= 25.0
+    assert "synthetic" in demo.source
+    assert demo.synthetic
+
+
+def test_a_mirrored_climb_is_the_mirror_image():
+    (a, _), (b, _) = clean(), clean(mirrored=True)
+    for name in a.names:
+        other = {"L": "R", "R": "L"}[name[0]] + name[1:] if name[0] in "LR" else name
+        image = b.point(other) * [1.0, -1.0, 1.0]
+        if name not in ("Neck", "Head", "Pelvis"):
+            np.testing.assert_allclose(a.point(name), image, atol=1e-12)
+
+
+def test_the_built_in_climb_is_always_the_same_and_another_seed_another_one():
+    a, b = load_demo("climb"), load_demo("climb")
+    np.testing.assert_array_equal(a.position, b.position)
+    other, _ = synthesize_climb(np.random.default_rng(1))
+    assert not np.array_equal(a.position, other.position)
+    assert any(g.filled for g in a.gaps)
+
+
+def test_noise_is_as_large_as_asked_for():
+    quiet, _ = synthesize_climb(
+        np.random.default_rng(3), options=ClimbOptions(noise=0.0, gaps=0)
+    )
+    loud, _ = synthesize_climb(
+        np.random.default_rng(3), options=ClimbOptions(noise=0.005, gaps=0)
+    )
+    assert np.std(loud.position - quiet.position) == pytest.approx(0.005, rel=0.02)
+
+
+def test_importing_demonstrations_does_not_import_scipy():
+    code = "import sys, clamber.demo; sys.exit('scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_real_climb_of_the_examples_is_0_48_m_high(shared):
+    if not (shared / "demos/climb-0").is_dir():
+        pytest.skip("the recording is not there")
+    demo = load_demo(Path(__file__).parents[1] / "examples/recordings/climb-0.yaml")
+    assert demo.scene.boxes[0].top.position[2] == pytest.approx(0.48, abs=1e-6)
+    np.testing.assert_allclose(demo.scene.boxes[0].size, [1.6, 0.48, 0.48], atol=1e-3)
+    for segment, (_, _, length) in SEGMENTS.items():
+        assert demo.subject[segment] == pytest.approx(length, abs=1e-3)
+    assert demo.subject["knee_height"] == pytest.approx(0.533, abs=0.01)
