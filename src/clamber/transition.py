@@ -154,7 +154,7 @@ def plan_transition(
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
     middle = np.mean([c.position for c in held], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
-    shift = ik.solve(
+    shift = ik.solve_hard(
         balance_problem(world, held=held, closed=rolling, q_reference=before.q),
         before.q,
     )
@@ -203,7 +203,7 @@ def _touch(
         q_reference=0.5 * (shifted + after),
     )
     problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
-    return ik.solve(problem, after)
+    return ik.solve_hard(problem, after)
 
 
 def eased_contact(ik: IK, before: Keyframe, move: Move, surface: str) -> Contact | None:
@@ -236,7 +236,7 @@ def eased_contact(ik: IK, before: Keyframe, move: Move, surface: str) -> Contact
         extra=(goal,),
         touching={surface: moved.support},
     )
-    solution = ik.solve(problem, before.q)
+    solution = ik.solve_hard(problem, before.q)
     if solution.status is not Status.SOLVED:
         return None
     ik.kin.update(solution.q)
@@ -273,7 +273,7 @@ def approach_contact(
         extra=(goal,),
         touching={wanted.surface: wanted.support},
     )
-    solution = ik.solve(problem, q)
+    solution = ik.solve_hard(problem, q)
     ik.kin.update(solution.q)
     support = world.supports[wanted.support]
     p = ik.kin.contact_point(wanted.surface, support.normal)

@@ -43,7 +43,7 @@ def optimise(
         )
         for c in task.new
     )
-    solution = ik.solve(keyframe_problem(world, task, options, goals), q)
+    solution = ik.solve_hard(keyframe_problem(world, task, options, goals), q)
     return finish(
         ik,
         task,

@@ -18,7 +18,7 @@ Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import daqp
@@ -140,6 +140,11 @@ class Residuals:
     limits: float
     worst_pair: int
     com_margin: float
+
+    @property
+    def worst(self) -> float:
+        """The largest shortfall of all [m, rad]."""
+        return max(self.contact, self.distance, self.balance, self.limits)
 
     @property
     def status(self) -> Status:
@@ -403,6 +408,31 @@ class IK:
         return Solution(
             q=q, iterations=n, residuals=self.residuals(problem, q), converged=converged
         )
+
+    def solve_hard(self, problem: PostureProblem, q: np.ndarray) -> Solution:
+        """`solve` for postures far from `q`, with more than one way to get there.
+
+        Distances make the problem non-convex: from `q`, a limb may be on the wrong side
+        of an edge. Where the straight way stalls, the solve is tried again from where it
+        stalled, and from the posture that would do if nothing could collide.
+        """
+        first = self.solve(problem, q)
+        if first.status is Status.SOLVED:
+            return first
+        ghost = replace(problem, clearance=np.full(len(problem.clearance), -np.inf))
+        best, iterations = first, first.iterations
+        for start in (first.q, None):
+            if start is None:
+                free = self.solve(ghost, q)
+                iterations += free.iterations
+                start = free.q
+            trial = self.solve(problem, start)
+            iterations += trial.iterations
+            if trial.residuals.worst < best.residuals.worst:
+                best = trial
+            if best.status is Status.SOLVED:
+                break
+        return replace(best, iterations=iterations)
 
     def residuals(self, problem: PostureProblem, q: np.ndarray) -> Residuals:
         """Recompute everything from the model at `q`."""
