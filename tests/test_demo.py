@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -337,6 +338,7 @@ def test_runs_are_half_open_ranges():
 # The built-in climb.
 
 
+@cache
 def clean(**options) -> tuple[Demonstration, list]:
     options = ClimbOptions(noise=0.0, gaps=0, **options)
     return synthesize_climb(np.random.default_rng(3), options=options)
