@@ -146,7 +146,7 @@ class ContactSequence:
     def __post_init__(self) -> None:
         """Check times and that contacts which go on keep their pose."""
         t = np.array(self.t, dtype=float)
-        if t.shape != (len(self.stances) + 1,) or np.any(np.diff(t) <= 0):
+        if t.shape != (len(self.stances) + 1,) or not np.all(np.diff(t) > 0):
             raise ValueError("times must increase, one more than there are stances")
         t.setflags(write=False)
         object.__setattr__(self, "t", t)

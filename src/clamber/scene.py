@@ -282,9 +282,17 @@ class SceneFile(_Strict):
 def input_error(error: pydantic.ValidationError, source: object) -> InputError:
     """The first fault of a validation as one sentence with file, field and value."""
     first = error.errors()[0]
-    where = ".".join(str(x) for x in first["loc"])
+    # Where a field may be one of two shapes, pydantic adds the shape to the path.
+    where = ".".join(
+        x for x in map(str, first["loc"]) if not x.startswith(("tuple[", "union["))
+    )
     text = first["msg"].removeprefix("Value error, ").removeprefix("expected ")
-    value = None if first["type"] == "missing" else first.get("input")
+    text = text.removeprefix("Input should be ")
+    value = first.get("input")
+    if first["type"] == "missing":
+        text, value = "a value: it is missing", None
+    elif first["type"] == "extra_forbidden":
+        text = "no such field"
     return InputError(text, source=source, field=where, value=value)
 
 
