@@ -60,3 +60,46 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip("no folder of recordings beside the repository")
     return folder
+
+
+# The demonstration planned and simulated once for all tests that look at the result.
+DEMO_HEIGHT = 0.275  # [m] the box of the method's own experiments
+
+
+@pytest.fixture(scope="session")
+def coman():
+    from clamber.model import load_robot
+
+    return load_robot("coman")
+
+
+@pytest.fixture(scope="session")
+def demo_sequence():
+    """What is detected in the built-in climb, at the person's scale."""
+    from clamber.demo import load_demo
+    from clamber.detect import detect_contacts
+
+    return detect_contacts(load_demo("climb"))
+
+
+@pytest.fixture(scope="session")
+def demo_plan(demo_sequence, coman):
+    from clamber.pipeline import plan
+    from clamber.scene import Scene
+
+    return plan(demo_sequence, coman, Scene.from_height(DEMO_HEIGHT))
+
+
+@pytest.fixture(scope="session")
+def demo_rollout(demo_plan):
+    from clamber.simulation import simulate
+
+    return simulate(demo_plan)
+
+
+@pytest.fixture(scope="session")
+def demo_kinematics(demo_plan):
+    """A workspace of the planned world: every test updates it before it looks."""
+    from clamber.model import Kinematics
+
+    return Kinematics(demo_plan.world)
