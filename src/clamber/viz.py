@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ AZIMUTH, ELEVATION = 288.0, -17.0  # [deg] from the left, a little behind: the b
 # neither the feet on the ground nor the hands on its top
 MARGIN = 0.08  # share of the picture left free around what must be seen
 EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
+GROUND_SHOWN = 7.0  # [m] half width of the ground in pictures
 LOADED = 0.01  # [weights] a surface that bears more is loaded
 TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
 SAMPLES = 400  # of a plot over time
@@ -49,10 +51,11 @@ VIDEO_SIZE = (640, 480)
 VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
 SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
 
+FORCE_LENGTH = 0.35  # [m] of the arrow of the robot's weight
 PHASE_COLOURS = {
-    "supporting": (0.10, 0.60, 0.25, 1.0),
-    "reach-to-supportable": (0.95, 0.75, 0.10, 1.0),
-    "sliding": (0.85, 0.10, 0.15, 1.0),
+    "supporting": (22, 163, 74),
+    "reach-to-supportable": (234, 179, 8),
+    "sliding": (220, 38, 38),
 }
 DARK, PALE, LINE = (35, 40, 48), (248, 249, 250), (205, 209, 214)
 SURFACE_COLOURS = ("#c2410c", "#1d4ed8")  # of a limb's surfaces, the outer one first
@@ -121,31 +124,35 @@ class View:
     distance: float
     azimuth: float
     elevation: float
+    fovy: float
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit vectors to the right, up and forward, in the world."""
+        return _camera_axes(self.azimuth, self.elevation)
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """(..., 2) pixels from the top left of points (..., 3) in the world."""
+        right, up, forward = self.axes
+        p = points - (self.lookat - self.distance * forward)
+        scale = size[1] / 2 / math.tan(math.radians(self.fovy) / 2) / (p @ forward)
+        x, y = size[0] / 2 + (p @ right) * scale, size[1] / 2 - (p @ up) * scale
+        return np.stack([x, y], axis=-1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Disc:
-    """A mark that lies on a support."""
-
-    centre: np.ndarray
-    normal: np.ndarray
-    radius: float
-    colour: tuple[float, float, float, float]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Rod:
-    """A mark from one point to another; an arrow where it has a head."""
-
-    start: np.ndarray
-    end: np.ndarray
-    radius: float
-    colour: tuple[float, float, float, float]
-    head: bool = False
+def _camera_axes(
+    azimuth: float, elevation: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    a, e = math.radians(azimuth), math.radians(elevation)
+    forward = np.array(
+        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
+    )
+    right = np.array([math.sin(a), -math.cos(a), 0.0])
+    return right, np.cross(right, forward), forward
 
 
 class Camera:
-    """Draws configurations of a world; a context manager, since OpenGL needs closing."""
+    """Draws configurations of a world; closed as a context manager."""
 
     def __init__(
         self, world: World, size: tuple[int, int], *, smooth: bool = True
@@ -163,8 +170,10 @@ class Camera:
         model = copy.copy(world.model)  # looks are set here, the world's stay
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4 if smooth else 0
-        model.vis.quality.shadowsize = 2048
-        model.vis.quality.numquads = 1
+        model.vis.quality.shadowsize = 4096 if smooth else 1024
+        # A ground without end is shaded with speckles where the shadow map ends.
+        model.vis.map.shadowclip = 4.0
+        model.geom_size[world.support_geom[GROUND], :2] = GROUND_SHOWN
         self._model, self._data = model, mujoco.MjData(model)
         self._gl = _gl_context(width, height)
         self._gl.make_current()
@@ -188,9 +197,7 @@ class Camera:
         if self._gl is not None:
             self._gl.free()
 
-    def shot(
-        self, q: np.ndarray, view: View, marks: Sequence[Disc | Rod] = ()
-    ) -> Image.Image:
+    def shot(self, q: np.ndarray, view: View) -> Image.Image:
         """A picture of the configuration `q` (nq,)."""
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
@@ -207,31 +214,9 @@ class Camera:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             self._scene,
         )
-        for mark in marks:
-            self._add(mark)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
         return Image.fromarray(self._pixels[::-1])
-
-    def _add(self, mark: Disc | Rod) -> None:
-        if self._scene.ngeom >= self._scene.maxgeom:
-            return
-        g = self._scene.geoms[self._scene.ngeom]
-        colour = np.array(mark.colour, dtype=np.float32)
-        if isinstance(mark, Disc):
-            kind, rod = mujoco.mjtGeom.mjGEOM_CYLINDER, None
-            radius, tip = mark.radius, mark.centre + 0.003 * mark.normal
-            rod = (mark.centre - 0.001 * mark.normal, tip)
-        else:
-            kind = mujoco.mjtGeom.mjGEOM_ARROW if mark.head else None
-            kind = mujoco.mjtGeom.mjGEOM_CAPSULE if kind is None else kind
-            radius, rod = mark.radius, (mark.start, mark.end)
-        mujoco.mjv_initGeom(
-            g, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour
-        )
-        mujoco.mjv_connector(g, kind, radius, *rod)
-        g.category = mujoco.mjtCatBit.mjCAT_DECOR.value
-        self._scene.ngeom += 1
 
 
 def frame_view(
@@ -250,12 +235,7 @@ def frame_view(
         fovy: Vertical field of view [deg].
     """
     azimuth = AZIMUTH + math.degrees(yaw)
-    a, e = math.radians(azimuth), math.radians(ELEVATION)
-    forward = np.array(
-        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
-    )
-    right = np.array([math.sin(a), -math.cos(a), 0.0])
-    up = np.cross(right, forward)
+    right, up, forward = _camera_axes(azimuth, ELEVATION)
     depth = points @ forward
     half = math.tan(math.radians(fovy) / 2) * (1 - MARGIN)
     ends, nearest = [], math.inf
@@ -271,6 +251,7 @@ def frame_view(
         distance=distance,
         azimuth=azimuth,
         elevation=ELEVATION,
+        fovy=fovy,
     )
 
 
@@ -322,54 +303,67 @@ def keyframe_sheet(
 ) -> Path:
     """Draw each keyframe with its contacts, forces and margins.
 
-    A disc lies under each contact: green while supporting, yellow within reach of it, red
-    sliding. Arrows are the contact forces, 0.3 m for the robot's weight; a thin line
-    falls from the centre of mass.
+    A dot marks each contact, seen through the robot: green while it supports, yellow
+    within reach of that, red where geometry alone would have it slide. Arrows are the
+    contact forces; a line falls from the centre of mass.
     """
     world = plan.world
-    postures = [k.q for k in plan.keyframes]
-    view = view_of(world, postures, tile[0] / tile[1])
+    view = view_of(world, [k.q for k in plan.keyframes], tile[0] / tile[1])
     tiles = []
     with Camera(world, tile) as camera:
         for i, key in enumerate(plan.keyframes):
+            picture = camera.shot(key.q, view)
+            mark_keyframe(picture, view, world, key)
             before = plan.keyframes[i - 1] if i else None
-            tiles.append(
-                (camera.shot(key.q, view, keyframe_marks(world, key)),
-                 keyframe_caption(i, key, before))
-            )  # fmt: skip
+            tiles.append((picture, keyframe_caption(i, key, before)))
     return _save_sheet(tiles, path, columns=min(4, len(tiles)))
 
 
-def keyframe_marks(world: World, key: Keyframe) -> list[Disc | Rod]:
-    """Discs, force arrows and the plumb line of a keyframe."""
-    marks: list[Disc | Rod] = []
-    forces = _force_by_contact(world, key)
-    weight = world.mass * 9.81
-    for state, force in zip(key.contacts, forces, strict=True):
-        c, colour = state.contact, PHASE_COLOURS[state.phase]
-        normal = world.supports[c.support].normal
-        marks.append(
-            Disc(centre=c.position, normal=normal, radius=0.045, colour=colour)
-        )
-        if np.linalg.norm(force) > LOADED * weight:
-            end = c.position + 0.3 / weight * force
-            marks.append(
-                Rod(start=c.position, end=end, radius=0.008, colour=colour, head=True)
-            )
+def mark_keyframe(
+    picture: Image.Image, view: View, world: World, key: Keyframe
+) -> None:
+    """Draw contacts, forces and the centre of mass over a picture."""
+    draw = ImageDraw.Draw(picture)
+    size, weight = picture.size, world.mass * 9.81
     floor = max(
-        (s.position[2] for s in world.supports.values() if s.inside(key.com)), default=0
+        (s.position[2] for s in world.supports.values() if s.inside(key.com)),
+        default=0.0,
     )
     foot = np.array([*key.com[:2], floor])
-    marks.append(Rod(start=key.com, end=foot, radius=0.004, colour=(0.1, 0.1, 0.1, 1)))
-    marks.append(
-        Disc(centre=foot, normal=np.array([0, 0, 1.0]), radius=0.02,
-             colour=(0.1, 0.1, 0.1, 1))
-    )  # fmt: skip
-    return marks
+    a, b = (tuple(x) for x in view.project(np.array([key.com, foot]), size))
+    draw.line((a, b), fill=DARK, width=1)
+    _dot(draw, a, 5, DARK)
+    draw.line((b[0] - 5, b[1], b[0] + 5, b[1]), fill=DARK, width=2)
+    for state, force in zip(key.contacts, _force_by_contact(world, key), strict=True):
+        colour = PHASE_COLOURS[state.phase]
+        at = state.contact.position
+        ends = np.array([at, at + FORCE_LENGTH / weight * force])
+        tail, tip = view.project(ends, size)
+        if np.linalg.norm(tip - tail) > 8:
+            _arrow(draw, tail, tip, colour)
+        _dot(draw, tuple(tail), 5, colour)
+
+
+def _dot(
+    draw: ImageDraw.ImageDraw, at: tuple, radius: int, colour: tuple[int, int, int]
+) -> None:
+    draw.circle(at, radius, fill=colour, outline=(255, 255, 255), width=1)
+
+
+def _arrow(
+    draw: ImageDraw.ImageDraw, tail: np.ndarray, tip: np.ndarray, colour: tuple
+) -> None:
+    way = (tip - tail) / np.linalg.norm(tip - tail)
+    side = np.array([-way[1], way[0]])
+    neck = tip - 9 * way
+    for width, fill in ((5, (255, 255, 255)), (3, colour)):
+        draw.line((*tail, *neck), fill=fill, width=width)
+    head = [tuple(tip), tuple(neck + 5 * side), tuple(neck - 5 * side)]
+    draw.polygon(head, fill=colour, outline=(255, 255, 255))
 
 
 def _force_by_contact(world: World, key: Keyframe) -> list[np.ndarray]:
-    """(3,) [N] for each contact, summed over its bearing points; zeros where unknown."""
+    """(3,) [N] of each contact, over all its bearing points; zeros where unknown."""
     kin = Kinematics(world)
     kin.update(key.q)
     counts = []
@@ -379,10 +373,7 @@ def _force_by_contact(world: World, key: Keyframe) -> list[np.ndarray]:
     if sum(counts) != len(key.equilibrium.forces):
         return [np.zeros(3)] * len(counts)
     ends = np.cumsum([0, *counts])
-    return [
-        key.equilibrium.forces[a:b].sum(axis=0)
-        for a, b in zip(ends, ends[1:], strict=False)
-    ]
+    return [key.equilibrium.forces[a:b].sum(axis=0) for a, b in pairwise(ends)]
 
 
 def describe_move(before: Sequence[Contact], after: Sequence[Contact]) -> str:
@@ -467,7 +458,7 @@ def _save_sheet(
     colours: int | None = None,
     gap: int = 6,
 ) -> Path:
-    """Tiles in rows, each over its caption; with a palette where the file is to be small."""
+    """Tiles in rows, each over its caption; with a palette the file is small."""
     width, height = tiles[0][0].size
     lines = max(len(c) for _, c in tiles)
     band = 8 + 18 * lines
@@ -588,7 +579,7 @@ def _finish_axes(ax: Axes) -> None:
 
 
 def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
-    """Projected distances of loaded contacts and the CoM's margin, with their limits."""
+    """Projected distances of loaded contacts, and the CoM's margin, with limits."""
     world = plan.world
     rows = _some(np.arange(len(rollout.time)), SAMPLES)
     t = rollout.time[rows]
@@ -604,7 +595,7 @@ def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
         top = "supported mass: shoulder" if "arm" in limb else "supported mass: hip"
         ax.set_title(f"{limb} ({top})", fontsize=9, loc="left")
         ax.set_xlim(t[0], t[-1])
-        ax.set_ylim(0.0, 1.05 * max(0.1, float(np.nanmax(np.append(limit, d)))))
+        ax.set_ylim(0.0, 1.3 * max(0.1, float(np.nanmax(np.append(limit, d)))))
         ax.set_ylabel("d [m]; dashed: limit", fontsize=8)
         _finish_axes(ax)
     ax = fig.add_subplot(grid[2, :])
@@ -615,6 +606,7 @@ def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
     ax.set_xlim(t[0], t[-1])
     ax.set_xlabel("time [s]")
     ax.set_ylabel("margin [m]", fontsize=8)
+    ax.set_ylim(top=1.3 * max(0.05, float(np.nanmax(np.append(margin, 0.0)))))
     _finish_axes(ax)
     return _save_plot(fig, path)
 
@@ -665,7 +657,7 @@ def support_below(world: World, kin: Kinematics, surface: str) -> Support:
 
 
 def cost_shapes(path: str | Path) -> Path:
-    """Cost of one contact along x: the norm, and the weighted norm with w = 5 (4.25)."""
+    """Cost of one contact along x: the norm, and weighted with w = 5 (4.25)."""
     x = np.linspace(-0.5, 0.5, 401)
     fig = Figure(figsize=(6, 3.6), layout="constrained")
     ax = fig.subplots()
@@ -744,14 +736,17 @@ def _frames(
     rows = np.searchsorted(rollout.time, times)
     moves = _move_names(plan)
     starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
-    drawn = (size[0] * 3 // 2, size[1] * 3 // 2)  # smoother edges at half the price
+    drawn = (
+        size[0] * 5 // 4,
+        size[1] * 5 // 4,
+    )  # smoother edges at a third of the price
     view = view_of(plan.world, _some(rollout.qpos, 60), size[0] / size[1])
     with Camera(plan.world, drawn, smooth=False) as camera:
         for i, (row, t) in enumerate(zip(rows, times, strict=True)):
             if i % 10 == 0:
                 report("video", i / len(rows), "")
             picture = camera.shot(rollout.qpos[row], view)
-            picture = picture.resize(size, Image.Resampling.BOX)
+            picture = picture.resize(size, Image.Resampling.BILINEAR)
             move = int(np.searchsorted(starts, t, side="right"))
             text = moves[move - 1] if 1 <= move <= len(moves) else "done"
             clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
@@ -765,9 +760,7 @@ def _frames(
 
 def _move_names(plan: Plan) -> list[str]:
     keys = plan.keyframes
-    return [
-        describe_move(a.stance, b.stance) for a, b in zip(keys, keys[1:], strict=False)
-    ]
+    return [describe_move(a.stance, b.stance) for a, b in pairwise(keys)]
 
 
 def _write_mp4(
@@ -780,10 +773,10 @@ def _write_mp4(
         size,
         fps=FPS,
         codec="libx264",
-        quality=None,
+        quality=5,
         macro_block_size=2,
         output_params=[
-            "-crf", "24", "-preset", "veryfast", "-movflags", "+faststart",
+            "-preset", "veryfast", "-movflags", "+faststart",
             "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
         ],
     )  # fmt: skip
