@@ -1,0 +1,393 @@
+"""Pictures: everything in view, marks where they belong, plots that say what is so."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import clamber
+from clamber import io, viz
+from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.errors import ClamberError, InputError
+from clamber.model import Kinematics
+from clamber.pipeline import Plan
+from clamber.scene import Box, Scene
+from clamber.simulation import Rollout
+
+SIZE = (160, 120)
+
+
+def contact(surface: str, support: str, x: float, y: float, z: float) -> Contact:
+    return Contact(
+        surface=surface,
+        support=support,
+        position=np.array([x, y, z]),
+        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+    )
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    """Standing, then the left hand on a box."""
+    scene = Scene.from_height(0.25)
+    feet = (
+        contact("LFoot", "ground", 0.03, 0.07, 0.0),
+        contact("RFoot", "ground", 0.03, -0.07, 0.0),
+    )
+    both = (*feet, contact("LHand", "box", 0.43, 0.17, 0.25))
+    sequence = ContactSequence(
+        source="made up",
+        subject=None,
+        scene=scene,
+        stances=(Stance(contacts=feet), Stance(contacts=both)),
+        t=np.array([0.0, 1.0, 2.0]),
+    )
+    return clamber.plan(sequence, clamber.load_robot("coman"), scene)
+
+
+@pytest.fixture(scope="module")
+def rollout(plan: Plan) -> Rollout:
+    return clamber.simulate(plan)
+
+
+@pytest.fixture
+def pictures() -> None:
+    if viz.gl_backend() is None:
+        pytest.skip("no OpenGL here")
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB")).astype(int)
+
+
+# Views.
+
+
+@pytest.mark.parametrize("aspect", [0.7, 1.0, 16 / 9])
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_the_nearest_view_has_every_point_in_and_one_on_the_border(
+    aspect: float, yaw: float, rng: np.random.Generator
+):
+    points = rng.uniform(-1, 1, (50, 3)) * [0.4, 0.3, 0.9] + [3.0, -2.0, 0.5]
+    view = viz.frame_view(points, aspect, yaw=yaw)
+    size = (round(1000 * aspect), 1000)
+    seen = view.project(points, size)
+    free = viz.MARGIN / 2 * np.array(size)
+    off = np.abs(seen - np.array(size) / 2) / (np.array(size) / 2 - free)
+    assert off.max() == pytest.approx(1.0, abs=2e-3)
+
+
+def test_points_are_drawn_where_the_projection_says(plan: Plan, pictures: None):
+    size = (320, 240)
+    world = plan.world
+    view = viz.view_of(world, [world.home], size[0] / size[1])
+    kin = Kinematics(world)
+    kin.update(world.home)
+    with viz.Camera(world, size) as camera:
+        picture = np.asarray(camera.shot(world.home, view)).astype(int)
+    x, y = view.project(kin.point(*foot_of(plan)), size).round().astype(int)
+    r, g, b = picture[y, x]  # the feet are orange
+    assert r > 1.5 * g > 1.5 * b
+
+
+def foot_of(plan: Plan) -> tuple[int, np.ndarray]:
+    s = plan.world.surfaces["LFoot"]
+    left = s.corners[s.corners[:, 1] > s.corners[:, 1].mean()]
+    return s.body, left.mean(axis=0) + np.array([0.0, 0.0, 0.012])
+
+
+def test_the_whole_robot_is_in_view_in_every_posture(plan: Plan, rollout: Rollout):
+    postures = rollout.qpos[::50]
+    view = viz.view_of(plan.world, postures, 4 / 3)
+    kin = Kinematics(plan.world)
+    for q in postures:
+        kin.update(q)
+        seen = view.project(viz.robot_corners(kin), (640, 480))
+        assert np.all(seen > 0)
+        assert np.all(seen < [640, 480])
+
+
+def test_the_near_edge_is_the_one_before_the_start():
+    scene = Scene.from_height(0.3)
+    edge = viz.near_edge_points(scene)
+    np.testing.assert_allclose(edge[:, 0], 0.23)
+    np.testing.assert_allclose(sorted(set(edge[:, 2].round(9))), [0.0, 0.3])
+    np.testing.assert_allclose(np.abs(edge[:, 1]), viz.EDGE_SHOWN)
+    left = replace(scene, start=np.array([0.73, -2.0, 0.0]))
+    np.testing.assert_allclose(viz.near_edge_points(left)[:, 1], -0.6)
+    nothing = Scene(start=np.zeros(3))
+    assert viz.near_edge_points(nothing).shape == (0, 3)
+
+
+# Words.
+
+
+def test_moves_are_described_by_what_changed():
+    feet = [contact("LFoot", "ground", 0, 0, 0), contact("RFoot", "ground", 0, 0, 0)]
+    hand = contact("LHand", "box", 0.4, 0.1, 0.2)
+    elbow = contact("LElbow", "box", 0.4, 0.1, 0.2)
+    moved = replace(hand, position=np.array([0.5, 0.1, 0.2]))
+    assert viz.describe_move(feet, [*feet, hand]) == "LHand on box"
+    assert viz.describe_move([*feet, hand], [*feet, elbow]) == "LElbow on box for LHand"
+    assert viz.describe_move([*feet, hand], [*feet, moved]) == "LHand on box"
+    assert viz.describe_move([*feet, hand], feet) == "LHand in the air"
+    assert viz.describe_move(feet, feet) == "no change"
+
+
+def test_a_caption_gives_the_figures_of_the_keyframe(plan: Plan):
+    first, last = plan.keyframes[0], plan.keyframes[-1]
+    title, geometry, balance = viz.keyframe_caption(1, last, first)
+    assert title == "1  LHand on box"
+    d = next(c for c in last.contacts if c.contact.surface == "LHand")
+    assert f"d LHand {1000 * d.projected_distance:.0f} mm" in geometry
+    assert f"CoM margin {1000 * last.com_margin:.0f} mm" in geometry
+    assert f"{last.equilibrium.margin:.2f} weights" in balance
+    assert str(last.equilibrium.limiting) in balance
+    assert viz.keyframe_caption(0, first, None)[0] == "0  start, on LFoot, RFoot"
+
+
+def test_forces_of_the_contacts_carry_the_weight(plan: Plan):
+    for key in plan.keyframes:
+        total = np.sum(viz._force_by_contact(plan.world, key), axis=0)
+        weight = [0.0, 0.0, plan.world.mass * 9.81]
+        np.testing.assert_allclose(total, weight, atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "speedup"), [(3.0, 1), (12.0, 1), (14.0, 1), (46.0, 4), (270.0, 32)]
+)
+def test_long_runs_are_shown_faster_by_a_power_of_two(seconds: float, speedup: int):
+    assert viz.speedup_of(seconds) == speedup
+    assert seconds / speedup <= viz.VIDEO_SECONDS
+
+
+# Figures over time.
+
+
+def test_the_figures_at_the_end_are_those_of_the_last_keyframe(
+    plan: Plan, rollout: Rollout
+):
+    rows = np.array([len(rollout.time) - 1])
+    d, limit, margin = viz.stability_over_time(plan.world, rollout, rows)
+    key = plan.keyframes[-1]
+    loaded = {s for s, x in zip(rollout.surfaces, d[0], strict=True) if np.isfinite(x)}
+    assert loaded == {c.contact.surface for c in key.contacts}
+    for c in key.contacts:
+        j = rollout.surfaces.index(c.contact.surface)
+        assert d[0, j] == pytest.approx(c.projected_distance, abs=0.015)
+        assert (d[0, j] <= limit[0, j]) == (c.phase == "supporting")
+    assert margin[0] == pytest.approx(key.com_margin, abs=0.015)
+
+
+def test_nothing_loaded_has_no_margin(plan: Plan, rollout: Rollout):
+    flying = replace(rollout, contact_force=np.zeros_like(rollout.contact_force))
+    d, limit, margin = viz.stability_over_time(plan.world, flying, np.array([0, 5]))
+    assert np.isnan(d).all()
+    assert np.isnan(limit).all()
+    assert np.isnan(margin).all()
+
+
+def test_a_surface_stands_on_the_support_below_it(plan: Plan, rollout: Rollout):
+    kin = Kinematics(plan.world)
+    kin.update(rollout.qpos[-1])
+    assert viz.support_below(plan.world, kin, "LHand").name == "box"
+    assert viz.support_below(plan.world, kin, "RFoot").name == "ground"
+
+
+def test_contact_in_the_plot_begins_and_ends_with_the_load():
+    mask = np.array([1, 1, 0, 0, 1, 0, 1], dtype=bool)
+    assert viz._runs(mask) == [(0, 2), (4, 5), (6, 7)]
+    assert viz._runs(np.zeros(3, dtype=bool)) == []
+
+
+# Files.
+
+
+def test_a_run_is_drawn_whole_and_twice_the_same(
+    plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
+):
+    io.save_plan(plan, tmp_path)
+    io.save_rollout(rollout, tmp_path)
+    told: list[tuple[str, float]] = []
+    files = viz.render_run(
+        tmp_path,
+        with_video=False,
+        report=lambda s, share, note: told.append((s, share)),
+    )
+    names = ["contacts.png", "stability.png", "keyframes.png", "climb.png"]
+    assert [f.name for f in files] == names
+    assert told[0] == ("pictures", 0.0)
+    assert told[-1] == ("pictures", 1.0)
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+    assert (tmp_path / "climb.png").stat().st_size < 300_000
+    for f in files:
+        assert pixels(f).std() > 10, f
+    before = {f: f.read_bytes() for f in files}
+    viz.render_run(tmp_path, with_video=False)
+    assert {f: f.read_bytes() for f in files} == before
+
+
+def test_a_plan_alone_shows_its_keyframes_with_their_contacts(
+    plan: Plan, tmp_path: Path, pictures: None
+):
+    io.save_plan(plan, tmp_path)
+    assert [f.name for f in viz.render_run(tmp_path)] == ["keyframes.png"]
+    green = viz.PHASE_COLOURS["supporting"]
+    sheet = pixels(tmp_path / "keyframes.png")
+    assert np.all(sheet == green, axis=2).sum() > 100
+
+
+def test_the_picture_of_another_posture_differs(plan: Plan, pictures: None):
+    view = viz.view_of(plan.world, [k.q for k in plan.keyframes], 4 / 3)
+    with viz.Camera(plan.world, SIZE) as camera:
+        a, b, c = (
+            np.asarray(camera.shot(plan.keyframes[i].q, view)) for i in (0, -1, 0)
+        )
+    assert np.array_equal(a, c)
+    assert np.mean(np.any(a != b, axis=2)) > 0.02
+
+
+def short(rollout: Rollout) -> Rollout:
+    """Its last second, ten times slower: a video of a few pictures."""
+    rows = slice(-20, None)
+    return replace(
+        rollout,
+        time=np.arange(20) * 0.02,
+        qpos=rollout.qpos[rows],
+        qvel=rollout.qvel[rows],
+    )
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_video_has_as_many_pictures_as_its_length_asks(
+    plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
+):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path = viz.video(plan, short(rollout), tmp_path)
+    assert path.name == "video.mp4"
+    frames = ffmpeg.read_frames(str(path))
+    about = next(frames)
+    assert about["size"] == viz.VIDEO_SIZE
+    assert about["fps"] == viz.FPS
+    assert len(list(frames)) == 10
+    assert len(path.read_bytes()) > 1000
+
+
+def test_without_ffmpeg_the_video_is_a_webp(
+    plan: Plan,
+    rollout: Rollout,
+    tmp_path: Path,
+    pictures: None,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    path = viz.video(plan, short(rollout), tmp_path)
+    assert path.name == "video.webp"
+    with Image.open(path) as picture:
+        assert picture.n_frames == 5
+        assert picture.size == (480, 360)
+
+
+def test_without_opengl_plots_are_drawn_and_the_reason_is_one_sentence(
+    plan: Plan, rollout: Rollout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    io.save_plan(plan, tmp_path)
+    io.save_rollout(rollout, tmp_path)
+    monkeypatch.setattr(viz, "gl_backend", lambda: None)
+    with pytest.raises(ClamberError, match="apt-get install libegl1") as e:
+        viz.render_run(tmp_path)
+    assert "\n" not in str(e.value)
+    drawn = {p.name for p in tmp_path.glob("*.png")}
+    assert drawn == {"contacts.png", "stability.png"}
+
+
+def test_a_backend_that_does_not_work_is_not_chosen(monkeypatch: pytest.MonkeyPatch):
+    viz.gl_backend.cache_clear()
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    assert viz.gl_backend() is None
+    viz.gl_backend.cache_clear()
+
+
+def test_a_folder_without_a_plan_is_not_drawn(tmp_path: Path):
+    with pytest.raises(InputError, match=r"plan\.json expected a readable file"):
+        viz.render_run(tmp_path)
+
+
+def test_the_demonstration_is_drawn_with_what_was_found(tmp_path: Path):
+    t = np.linspace(0.0, 4.0, 200)
+    names = (*clamber.demo.PARTS, "LShoulder", "RShoulder", "LHip", "RHip", "Pelvis")
+    position = np.zeros((len(t), len(names), 3))
+    position[:, :, 2] = 0.5 + 0.3 * np.sin(t)[:, None] + 0.02 * np.arange(len(names))
+    box = Box(
+        name="table",
+        size=np.ones(3),
+        position=np.array([1, 0, 0.0]),
+        rotation=np.eye(3),
+    )
+    scene = Scene(boxes=(box,), start=np.zeros(3))
+    demo = clamber.Demonstration(
+        source="made up",
+        t=t,
+        names=names,
+        position=position,
+        valid=np.ones(position.shape[:2], dtype=bool),
+        scene=scene,
+        subject={"thigh": 0.4},
+    )
+    hand = contact("LHand", "table", 1.0, 0.1, 0.5)
+    interval = ContactInterval(
+        part="LHand", is_surface=True, t0=1.0, t1=2.0, contact=hand
+    )
+    bare = ContactSequence(
+        source="made up",
+        subject=None,
+        scene=scene,
+        stances=(Stance(contacts=(hand,)),),
+        t=np.array([0.0, 4.0]),
+    )
+    found = replace(bare, intervals=(interval,))
+    a = pixels(viz.demonstration_plot(demo, bare, tmp_path / "a.png"))
+    b = pixels(viz.demonstration_plot(demo, found, tmp_path / "b.png"))
+    changed = np.argwhere(np.any(a != b, axis=2))
+    assert len(changed) > 100
+    height, width, _ = a.shape
+    assert changed[:, 0].max() < height / 2  # the left arm is the first panel
+    assert changed[:, 1].max() < width / 2
+
+
+def test_the_weighted_norm_is_five_times_the_norm(tmp_path: Path):
+    picture = pixels(viz.cost_shapes(tmp_path / "cost.png"))
+
+    def top(colour: tuple[int, int, int]) -> int:
+        """Highest pixel of a curve, its legend at the top centre left out."""
+        found = np.all(np.abs(picture - colour) < 30, axis=2)
+        found[:, picture.shape[1] // 4 : -picture.shape[1] // 4] = False
+        return int(np.argwhere(found)[:, 0].min())
+
+    def bottom() -> int:
+        found = np.all(np.abs(picture - (0x1D, 0x4E, 0xD8)) < 30, axis=2)
+        return int(np.argwhere(found)[:, 0].max())
+
+    low = bottom()
+    ratio = (low - top((0x1D, 0x4E, 0xD8))) / (low - top((0xB9, 0x1C, 0x1C)))
+    assert ratio == pytest.approx(5.0, rel=0.06)
+
+
+def test_loading_the_module_changes_no_setting():
+    code = "import os, json; a = dict(os.environ); import clamber.viz; "
+    code += "print(json.dumps({k: v for k, v in os.environ.items() if a.get(k) != v}))"
+    out = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+        env={k: v for k, v in os.environ.items() if k != "MUJOCO_GL"},
+    )  # fmt: skip
+    assert json.loads(out.stdout) == {}
