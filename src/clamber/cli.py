@@ -16,6 +16,7 @@ import json
 import math
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
@@ -34,7 +35,7 @@ from rich.progress import (
 from rich.table import Table
 
 import clamber
-from clamber.errors import ClamberError, InputError
+from clamber.errors import ClamberError, InputError, MissingDependency
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 DEFAULT_HEIGHT = 0.275  # [m] of the box where no scene is given
@@ -78,9 +79,9 @@ class Output:
     def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
         """Print one JSON object, or tables and a closing sentence, on stdout."""
         if self.json:
-            sys.stdout.write(json.dumps({"version": 1, **record}) + "\n")
+            sys.stdout.write(json.dumps({"version": 1, **record}, allow_nan=False) + "\n")
         elif not self.quiet:
-            width = None if sys.stdout.isatty() else 100
+            width = None if sys.stdout.isatty() else 140
             console = Console(width=width, highlight=False, markup=False)
             for table in tables:
                 console.print(table)
@@ -156,6 +157,20 @@ class WorldFlags:
         scene = _scene(self.height, self.scene)
         return clamber.load_robot(self.robot), scene
 
+    @contextlib.contextmanager
+    def blamed(self) -> Iterator[None]:
+        """Name the file or flag of a scene that turns out not to fit."""
+        try:
+            yield
+        except InputError as e:
+            if e.source is not None or not (e.field or "").startswith("scene"):
+                raise
+            source = "--height" if self.scene is None else self.scene
+            field = str(e.field).removeprefix("scene.")
+            raise InputError(
+                e.expected, source=source, field=field, value=e.value
+            ) from e
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningFlags:
@@ -198,7 +213,7 @@ class ClimbCommand:
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     video: bool = False
-    """Draw pictures and a video of what physics did."""
+    """Draw a video too, not pictures alone."""
     out: Place = None
     """The run folder (runs/climb, then runs/climb-2 ...)."""
     output: Printed
@@ -206,16 +221,32 @@ class ClimbCommand:
     def run(self) -> int:
         """Recording to verdict."""
         robot, scene = self.world.load()
-        with self.output.progress() as report:
+        clock = Clock()
+        with self.output.progress() as show:
+            report = clock.watching(show)
             report("detect", 0.0, "")
-            sequence = clamber.detect_contacts(clamber.load_demo(self.demo))
+            demo = clamber.load_demo(self.demo)
+            sequence = clamber.detect_contacts(demo)
+            report("detect", 1.0, "")
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
-            plan = _plan(sequence, robot, scene, self.planning, folder, report)
+            with self.world.blamed():
+                plan = _plan(sequence, robot, scene, self.planning, folder, report)
             verdict = _simulate(plan, folder, report)
-            if self.video and verdict is not None:
-                _render(folder, report)
-        return _conclude(self.output, folder, plan, verdict)
+            missing = ""
+            try:
+                clamber.render_run(
+                    folder,
+                    with_video=self.video,
+                    demonstration=(demo, sequence),
+                    report=report,
+                )
+            except MissingDependency as e:  # the robot has climbed all the same
+                missing = str(e)
+            clamber.save_timings(folder, clock.stages())
+        if missing and not self.output.quiet:
+            sys.stderr.write(f"clamber: {missing}\n")
+        return _conclude(self.output, folder, plan, verdict, clock)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,17 +297,16 @@ class PlanCommand:
         """Contact sequence to trajectory."""
         sequence = clamber.load_sequence(self.sequence)
         robot, scene = self.world.load()
-        with self.output.progress() as report:
+        clock = Clock()
+        with self.output.progress() as show:
             folder = clamber.new_run_folder(self.out, "plan")
-            plan = _plan(sequence, robot, scene, self.planning, folder, report)
-        table = _table("keyframe", "contacts", "CoM margin [m]")
-        for i, key in enumerate(plan.keyframes):
-            on = ", ".join(f"{c.surface} on {c.support}" for c in key.stance)
-            table.add_row(str(i), on, f"{key.com_margin:.3f}")
-        record = {"out": str(folder), **_plan_record(plan)}
-        self.output.show(
-            record, table, *_skipped(plan), note=f"the plan is in {folder}"
-        )
+            clamber.save_sequence(sequence, folder / "sequence.json")
+            report = clock.watching(show)
+            with self.world.blamed():
+                plan = _plan(sequence, robot, scene, self.planning, folder, report)
+        record = {"out": str(folder), **_plan_record(plan, clock)}
+        note = f"{_outcome(plan)}: the files are in {folder}"
+        self.output.show(record, _keyframes(record), *_skipped(plan), note=note)
         return REACHED if plan.complete else MISSED
 
 
@@ -291,8 +321,10 @@ class SimulateCommand:
     def run(self) -> int:
         """Plan to verdict."""
         plan = clamber.load_plan(self.run_folder)
-        with self.output.progress() as report:
-            verdict = _simulate(plan, self.run_folder, report)
+        clock = Clock()
+        with self.output.progress() as show:
+            verdict = _simulate(plan, self.run_folder, clock.watching(show))
+            clamber.save_timings(self.run_folder, clock.stages())
         return _conclude(self.output, self.run_folder, plan, verdict)
 
 
@@ -307,7 +339,7 @@ class RenderCommand:
     def run(self) -> int:
         """Rollout to pictures."""
         with self.output.progress() as report:
-            files = _render(self.run_folder, report)
+            files = clamber.render_run(self.run_folder, report=report)
         names = [str(f) for f in files]
         self.output.show({"files": names}, note="\n".join(names))
         return REACHED
@@ -414,26 +446,118 @@ def _simulate(
     return verdict
 
 
-def _render(folder: Path, report: Report) -> list[Path]:
-    """Draw."""
-    report("render", 0.0, "")
-    return clamber.render_run(folder)
-
-
 def _table(*columns: str) -> Table:
     table = Table(*columns, box=None, header_style="bold", pad_edge=False)
     table.columns[-1].overflow = "fold"
     return table
 
 
-def _plan_record(plan: clamber.Plan) -> dict[str, Any]:
-    """What `--json` says of a plan."""
-    skipped = [{"stance": s.stance, "reason": s.reason} for s in plan.skipped]
+class Clock:
+    """Seconds by stage and by move, from what the stages report of themselves."""
+
+    def __init__(self) -> None:
+        """Nothing has run yet."""
+        self._stages: dict[str, float] = {}
+        self._moves: list[tuple[str, float]] = []
+
+    def watching(self, report: Report) -> Report:
+        """A report that also takes the time."""
+        began: dict[tuple[str, float, str], float] = {}
+        last: tuple[str, float, str] | None = None
+
+        def timed(stage: str, done: float, note: str) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            if last is not None:
+                spent = now - began[last]
+                self._stages[last[0]] = self._stages.get(last[0], 0.0) + spent
+                if last[0] == "plan":
+                    self._add(last, spent)
+            last = (stage, done, note)
+            began[last] = now
+            report(stage, done, note)
+
+        return timed
+
+    def _add(self, step: tuple[str, float, str], spent: float) -> None:
+        """A move that is tried again, for a later one's sake, costs both times."""
+        for i, (note, seconds) in enumerate(self._moves):
+            if note == step[2]:
+                self._moves[i] = (note, seconds + spent)
+                return
+        self._moves.append((step[2], spent))
+
+    def stages(self) -> dict[str, float]:
+        """Seconds by stage."""
+        return dict(self._stages)
+
+    def of(self, move: object) -> float | None:
+        """Seconds that a move took; None where it was not watched."""
+        return dict(self._moves).get(str(move))
+
+
+def _plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any]:
+    """What `--json` says of a plan; costs and margins are those of `plan.json`."""
+    moves = [None, *(p.transition.move for p in plan.paths)]
+    keyframes = []
+    for i, key in enumerate(plan.keyframes):
+        move = moves[i] if i < len(moves) else None
+        keyframes.append(
+            {
+                "move": "start" if i == 0 else str(move),
+                "method": key.method,
+                "iterations": key.iterations,
+                "seconds": None if clock is None or i == 0 else clock.of(move),
+                "cost_before": key.cost_before,
+                "cost_after": key.cost_after,
+                "projected_distance": {
+                    c.contact.surface: c.projected_distance for c in key.contacts
+                },
+                "com_margin": key.com_margin if math.isfinite(key.com_margin) else None,
+                "equilibrium_margin": key.equilibrium.margin,
+                "limiting": key.equilibrium.limiting,
+            }
+        )
     return {
         "complete": plan.complete,
-        "keyframes": len(plan.keyframes),
-        "skipped": skipped,
+        "keyframes": keyframes,
+        "skipped": [{"stance": s.stance, "reason": s.reason} for s in plan.skipped],
     }
+
+
+def _keyframes(record: Mapping[str, Any]) -> Table:
+    """The keyframes of a record, a row each."""
+    table = _table(
+        "move", "method", "iter", "s", "cost", "", "d [mm] of each contact",
+        "CoM [mm]", "push", "limit",
+    )  # fmt: skip
+    for k in record["keyframes"]:
+        d = " ".join(
+            f"{s} {1000 * x:.0f}" for s, x in k["projected_distance"].items()
+        )
+        com = k["com_margin"]
+        table.add_row(
+            k["move"],
+            k["method"],
+            str(k["iterations"]),
+            "" if k["seconds"] is None else f"{k['seconds']:.2f}",
+            f"{k['cost_before']:.3f}",
+            f"{k['cost_after']:.3f}",
+            d,
+            "-" if com is None else f"{1000 * com:.0f}",
+            f"{k['equilibrium_margin']:.2f}",
+            k["limiting"] or "-",
+        )
+    return table
+
+
+def _outcome(plan: clamber.Plan) -> str:
+    """One clause: planned to the end, or why not."""
+    if plan.complete:
+        return "planned to the last stance"
+    missed = [s.reason for s in plan.skipped if " -> " in s.reason]
+    why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
+    return f"the robot cannot do it, {why}"
 
 
 def _skipped(plan: clamber.Plan) -> list[Table]:
@@ -447,7 +571,11 @@ def _skipped(plan: clamber.Plan) -> list[Table]:
 
 
 def _conclude(
-    output: Output, folder: Path, plan: clamber.Plan, verdict: clamber.Verdict | None
+    output: Output,
+    folder: Path,
+    plan: clamber.Plan,
+    verdict: clamber.Verdict | None,
+    clock: Clock | None = None,
 ) -> int:
     """Show the verdict and where the files are; the exit code says the same."""
     table = _table("criterion", "value", "limit", "")
@@ -455,10 +583,7 @@ def _conclude(
     for name, c in criteria.items():
         table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
     reached = verdict is not None and verdict.reached
-    if verdict is None:
-        note = "no move of the sequence could be planned"
-    else:
-        note = "the robot made it" if reached else "the robot did not make it"
+    planned = _plan_record(plan, clock)
     record = {
         "out": str(folder),
         "reached": reached,
@@ -466,9 +591,18 @@ def _conclude(
             n: {"value": c.value, "limit": c.limit, "ok": c.ok}
             for n, c in criteria.items()
         },
-        **_plan_record(plan),
+        **planned,
     }
-    tables = [*_skipped(plan), table] if criteria else _skipped(plan)
+    if reached:
+        note = "the robot made it"
+    elif not plan.complete:
+        note = _outcome(plan)
+    else:
+        wrong = [n for n, c in criteria.items() if not c.ok]
+        note = f"the robot did not make it ({', '.join(wrong) or 'nothing planned'})"
+    tables = [_keyframes(planned)] if clock is not None else []
+    tables += _skipped(plan)
+    tables += [table] if criteria else []
     output.show(record, *tables, note=f"{note}: the files are in {folder}")
     return REACHED if reached else MISSED
 

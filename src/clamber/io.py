@@ -35,7 +35,7 @@ from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, Wor
 from clamber.pipeline import Plan, PlanOptions, Skipped
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
-from clamber.scene import Box, Scene
+from clamber.scene import Box, Scene, input_error
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
 from clamber.statics import Phase, StaticEquilibrium
@@ -200,20 +200,7 @@ def _read_json(path: Path, kind: type[_Model]) -> _Model:
     try:
         return kind.model_validate(content)
     except pydantic.ValidationError as e:
-        raise _misfit(e, path) from e
-
-
-def _misfit(error: pydantic.ValidationError, path: Path) -> InputError:
-    """The first fault of a machine's file."""
-    first = error.errors()[0]
-    where = ".".join(str(x) for x in first["loc"])
-    if first["type"] == "missing":
-        return InputError("a value: there is none", source=path, field=where)
-    text = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    value = first.get("input")
-    if isinstance(value, (dict, list, tuple)):
-        value = f"{type(value).__name__} of {len(value)}"
-    return InputError(text, source=path, field=where, value=value)
+        raise input_error(e, path) from e
 
 
 def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -718,7 +705,7 @@ def load_plan(folder: str | Path) -> Plan:
     try:
         options = pydantic.TypeAdapter(PlanOptions).validate_python(file.options)
     except pydantic.ValidationError as e:
-        raise _misfit(e, path) from e
+        raise input_error(e, path) from e
     sequence = file.sequence.sequence(path)
     world = _load_world(folder / SCENE, _robot(file.robot), sequence.scene)
     nq = world.model.nq

@@ -628,6 +628,7 @@ class Kinematics:
         self._jacp = np.zeros((3, m.nv))
         self._jacr = np.zeros((3, m.nv))
         self._fromto = np.zeros(6)
+        self._turn = np.zeros(3)
         first, second = world.pairs.T
         self._first, self._second = first, second
         radius = m.geom_rbound.copy()
@@ -723,8 +724,10 @@ class Kinematics:
         s = self.world.surfaces[surface]
         if link is None or s.radius == 0.0:
             return np.zeros(3)
-        turn = rotation_vector(self.rotation(s.body) @ matrix_from_quat(link).T)
-        return s.radius * np.cross(turn, normal)
+        mujoco.mju_subQuat(self._turn, self.data.xquat[s.body], link)
+        x, y, z = (s.radius * (self.rotation(s.body) @ self._turn)).tolist()
+        nx, ny, nz = normal.tolist()
+        return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
 
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
         """(3,) world rotation vector from the surface's frame to the contact frame."""

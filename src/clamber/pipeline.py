@@ -21,7 +21,7 @@ from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
 from clamber.scene import Scene
-from clamber.search import search
+from clamber.search import plan_steps
 from clamber.trajectory import Trajectory, build_trajectory
 
 Method = Literal["direct", "lbfgs", "gradient"]
@@ -96,7 +96,7 @@ def plan(
     clock.lap("retarget")
 
     steps, skipped = split_moves(goal, world)
-    found = search(
+    found = plan_steps(
         ik, steps, options.method, options.keyframe, lap=clock.lap, report=report
     )
     trajectory = None

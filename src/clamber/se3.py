@@ -29,7 +29,12 @@ def matrix_from_rpy(rpy: ArrayLike) -> np.ndarray:
 
 def matrix_from_quat(quat: ArrayLike) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(quat, dtype=float), -1, 0)
+    quat = np.asarray(quat, dtype=float)
+    if quat.ndim == 1:
+        out = np.empty(9)
+        mujoco.mju_quat2Mat(out, quat)
+        return out.reshape(3, 3)
+    w, x, y, z = np.moveaxis(quat, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

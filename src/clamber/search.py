@@ -56,7 +56,7 @@ class Found:
     missed: tuple[Skipped, ...]
 
 
-def search(
+def plan_steps(
     ik: IK,
     steps: Sequence[Step],
     method: str,

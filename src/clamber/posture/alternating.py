@@ -22,7 +22,6 @@ from clamber.posture.keyframe import (
 )
 
 INNER_ITERATIONS = 12  # QPs between two updates of the contacts, warm
-FIRST_ITERATIONS = 60
 
 
 class Alternation:
@@ -39,10 +38,13 @@ class Alternation:
         self.before, _ = stability_cost(
             ik.kin, task, references, options.stability_weight
         )
-        self._fresh = True
+        self.lowest = np.inf
+        margins = [(s.polygon.min(axis=0), s.polygon.max(axis=0)) for s in self.supports]
+        self.lower = np.array([lo + EDGE_INSET for lo, _ in margins]).ravel()
+        self.upper = np.array([hi - EDGE_INSET for _, hi in margins]).ravel()
 
     def start(self) -> np.ndarray:
-        """(2n,) the references, in their supports' planes."""
+        """(2n,) the references, in their supports' planes, inside their bounds."""
         local = [
             s.rotation[:, :2].T @ (c.position - s.position)
             for s, c in zip(self.supports, self.task.new, strict=True)
@@ -51,14 +53,7 @@ class Alternation:
 
     def clip(self, x: np.ndarray) -> np.ndarray:
         """(2n,) moved inside the supports' bounds."""
-        out = x.copy().reshape(-1, 2)
-        for i, s in enumerate(self.supports):
-            lo, hi = (
-                s.polygon.min(axis=0) + EDGE_INSET,
-                s.polygon.max(axis=0) - EDGE_INSET,
-            )
-            out[i] = np.clip(out[i], lo, np.maximum(lo, hi))
-        return out.ravel()
+        return np.clip(x, self.lower, self.upper)
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """(n, 3) in the world."""
@@ -70,36 +65,43 @@ class Alternation:
         ).reshape(-1, 3)
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """L_s and its gradient (n, 2) in the supports' planes, after IK for `x`."""
-        self._solve(x)
+        """L_s and its gradient (2n,) in the supports' planes, after IK for `x`.
+
+        Every evaluation starts from the posture of the lowest cost so far: a trial that
+        went too far leaves no trace.
+        """
+        q = self._solve(x)
+        kin = self.ik.kin
+        kin.update(q)
         cost, grad = stability_cost(
-            self.ik.kin,
+            kin,
             self.task,
-            new_positions(self.ik.kin, self.task),
+            new_positions(kin, self.task),
             self.options.stability_weight,
         )
+        if cost < self.lowest:
+            self.lowest, self.q = cost, q
         for i, s in enumerate(self.supports):
             grad[i] = s.rotation[:2, :2].T @ grad[i]
-        return cost, grad
+        return cost, grad.ravel()
 
     def finish(self, x: np.ndarray, *, method: str, iterations: int) -> Keyframe:
         """The posture for the final positions, measured."""
-        self._fresh = True
-        self._solve(x)
+        self.lowest = np.inf
         return finish(
             self.ik,
             self.task,
             self.options,
-            self.q,
+            self._solve(x),
             method=method,
             iterations=iterations,
             cost_before=self.before,
         )
 
-    def _solve(self, x: np.ndarray) -> None:
-        goals = prescribed_goals(self.ik.world, self.task, self.positions(self.clip(x)))
+    def _solve(self, x: np.ndarray) -> np.ndarray:
+        positions = self.positions(self.clip(x))
+        goals = prescribed_goals(self.ik.world, self.task, positions)
         problem = keyframe_problem(self.ik.world, self.task, self.options, goals)
-        n = FIRST_ITERATIONS if self._fresh else INNER_ITERATIONS
-        self._fresh = False
-        self.q = self.ik.solve(problem, self.q, iterations=n).q
-        self.ik.kin.update(self.q)
+        if np.isinf(self.lowest):
+            return self.ik.solve_hard(problem, self.q).q
+        return self.ik.solve(problem, self.q, iterations=INNER_ITERATIONS).q

@@ -30,7 +30,7 @@ def optimise(
         step = options.learning_rate / options.stability_weight
         trial, trial_cost, trial_grad = x, cost, grad
         for _ in range(MAX_HALVINGS):
-            trial = alternation.clip(x - step * grad.ravel())
+            trial = alternation.clip(x - step * grad)
             trial_cost, trial_grad = alternation.evaluate(trial)
             if trial_cost <= cost:
                 break

@@ -40,6 +40,8 @@ STEP_TRANSLATION = 0.08  # [m] largest step of the base
 RECOVERY_STEP = 0.05  # [m, rad] of a violation that one step is asked to make good
 ACTIVE_RANGE = 0.10  # [m] farther pairs have no row
 DAMPING = 2e-4  # mu
+NEAR_RANGE = 0.03  # [m] pairs this near always have a row
+SLOW = 0.01  # share of the merit; three steps that gain less end the solve
 MIN_RADIUS = 1e-3  # of the trust region, where the solve has stalled
 PENALTY = 1e6  # of violations against the soft cost, in the merit of a step
 CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
@@ -289,8 +291,16 @@ class IK:
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._geom_body = world.model.geom_bodyid
 
-    def build(self, problem: PostureProblem, q: np.ndarray) -> QP:
-        """The QP at `q`; `Kinematics` of this workspace is left at `q`."""
+    def build(
+        self, problem: PostureProblem, q: np.ndarray, reach: float = ACTIVE_RANGE
+    ) -> QP:
+        """The QP at `q`; `Kinematics` of this workspace is left at `q`.
+
+        Args:
+            problem: What is wanted.
+            q: (nq,).
+            reach: Pairs farther apart than this have no row [m].
+        """
         kin, w = self.kin, self.world
         kin.update(q)
         soft, hard, ineq = self._soft, self._hard, self._ineq
@@ -305,7 +315,7 @@ class IK:
             self._lean_rows(*problem.lean)
         if problem.balance:
             self._balance_rows(problem)
-        self._distance_rows(problem.clearance)
+        self._distance_rows(problem.clearance, reach)
 
         nv = w.model.nv
         J, e = soft.J[: soft.n], soft.lo[: soft.n]
@@ -390,16 +400,21 @@ class IK:
         and tried again a quarter as long. The first step is always taken: a new contact
         must be allowed to start.
         """
-        n, converged, radius = 0, False, 1.0
+        n, converged, radius, slow = 0, False, 1.0, 0
         qp = self.build(problem, q)
         for n in range(1, iterations + 1):
             dq = self.step(qp, radius)
             size = float(np.abs(dq).max())
             trial = self.kin.integrate(q, dq)
-            new = self.build(problem, trial)
+            # The next step will hardly be much longer than this one.
+            reach = min(NEAR_RANGE + size, ACTIVE_RANGE)
+            new = self.build(problem, trial, reach)
             if n == 1 or new.merit <= qp.merit:
+                gain = qp.merit - new.merit
+                slow = slow + 1 if gain < SLOW * new.merit else 0
+                small = size < tolerance and size < 0.9 * radius * STEP_ROTATION
+                converged = small or slow >= 3
                 q, qp = trial, new
-                converged = size < tolerance and size < 0.9 * radius * STEP_ROTATION
                 radius = min(2.0 * radius, 1.0)
             else:
                 radius *= 0.25
@@ -700,9 +715,9 @@ class IK:
             (self._jac - self._jac2) / length, (b - a) / length - direction, weight
         )
 
-    def _distance_rows(self, clearance: np.ndarray) -> None:
+    def _distance_rows(self, clearance: np.ndarray, reach: float) -> None:
         kin = self.kin
-        near = kin.proximity(ACTIVE_RANGE, np.isfinite(clearance))
+        near = kin.proximity(reach, np.isfinite(clearance))
         if len(near.pairs) == 0:
             return
         k = self._ineq.take(len(near.pairs))

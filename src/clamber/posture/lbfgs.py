@@ -20,19 +20,27 @@ def optimise(
     if len(x) == 0:
         return alternation.finish(x, method="lbfgs", iterations=0)
 
-    def cost_and_gradient(x: np.ndarray) -> tuple[float, np.ndarray]:
-        cost, grad = alternation.evaluate(x)
-        return cost, grad.ravel()
+    # In units in which a step along the gradient is X - S, what (4.24) asks for: the
+    # method's first step is as long as the gradient, and would leave the robot's reach.
+    unit = np.sqrt(2.0 * options.stability_weight)
+
+    def cost_and_gradient(y: np.ndarray) -> tuple[float, np.ndarray]:
+        cost, grad = alternation.evaluate(y / unit)
+        return cost, grad / unit
 
     result = minimize(
         cost_and_gradient,
-        x,
+        x * unit,
         jac=True,
         method="L-BFGS-B",
+        bounds=list(
+            zip(alternation.lower * unit, alternation.upper * unit, strict=True)
+        ),
         options={
             "maxiter": options.max_iterations,
             "ftol": options.delta_stop,
             "gtol": options.gradient_stop,
         },
     )
-    return alternation.finish(result.x, method="lbfgs", iterations=int(result.nit))
+    x = result.x / unit
+    return alternation.finish(x, method="lbfgs", iterations=int(result.nit))
