@@ -1,0 +1,299 @@
+"""Boxes and their supports against geometry by hand; mistakes in files are named."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clamber.errors import InputError
+from clamber.scene import GROUND, Box, Scene, Support, load_scene
+from clamber.se3 import matrix_from_rpy
+
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def box_at(rpy=(0.0, 0.0, 0.0), size=(0.8, 0.5, 0.3), position=(0.4, -0.2, 0.6)) -> Box:
+    return Box(
+        name="box",
+        size=np.array(size),
+        position=np.array(position),
+        rotation=matrix_from_rpy(rpy),
+    )
+
+
+def corners_of(box: Box) -> np.ndarray:
+    """(8, 3) corners in the world, written out."""
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    return box.position + (signs * box.size / 2) @ box.rotation.T
+
+
+def support_of(polygon: np.ndarray, rpy=(0.0, 0.0, 0.0)) -> Support:
+    return Support(
+        name="s",
+        position=np.array([0.3, 0.2, 0.1]),
+        rotation=matrix_from_rpy(rpy),
+        polygon=polygon,
+        friction=0.8,
+    )
+
+
+def written(path: Path, text: str) -> Path:
+    file = path / "scene.yaml"
+    file.write_text(text)
+    return file
+
+
+def one_box(**changes: str) -> str:
+    """A valid file with one box, some of its fields changed."""
+    fields = {"name": "table", "size": "[1.0, 0.6, 0.275]", "position": "[0.73, 0.0]"}
+    fields |= changes
+    return "boxes:\n  - {" + ", ".join(f"{k}: {v}" for k, v in fields.items()) + "}\n"
+
+
+# The scene of a height.
+
+
+def test_a_height_makes_one_box_with_its_near_face_before_the_ankles():
+    scene = Scene.from_height(0.275)
+    (box,) = scene.boxes
+    np.testing.assert_array_equal(scene.start, 0.0)
+    np.testing.assert_array_equal(box.size, [1.0, 1.2, 0.275])
+    corners = corners_of(box)
+    np.testing.assert_allclose(corners.min(axis=0), [0.23, -0.6, 0.0], atol=1e-15)
+    np.testing.assert_allclose(corners.max(axis=0), [1.23, 0.6, 0.275], atol=1e-15)
+    assert scene.goal is None
+
+
+def test_friction_of_a_height_holds_for_box_and_ground():
+    scene = Scene.from_height(0.3, friction=0.35)
+    assert [s.friction for s in scene.supports] == [0.35, 0.35]
+
+
+@pytest.mark.parametrize("height", [0.0, -0.2, math.nan, math.inf, 275.0])
+def test_no_height_but_a_positive_one_in_metres_is_taken(height):
+    with pytest.raises(ValueError, match="size"):
+        Scene.from_height(height)
+
+
+# Supports.
+
+
+@pytest.mark.parametrize(
+    "rpy",
+    [
+        (0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.7),
+        (0.3, 0.0, 0.0),
+        (-0.2, 0.35, 1.9),
+        (np.pi, 0.1, 0.0),  # upside down: the other face is the top
+        (np.pi / 2, 0.0, 0.4),  # on its side
+        (0.0, -np.pi / 2, 0.2),
+    ],
+)
+def test_the_top_is_the_highest_face_and_points_out(rpy):
+    box = box_at(rpy)
+    top = box.top
+    R = top.rotation
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    corners = corners_of(box)
+    # Its four vertices are corners of the box, and the box lies behind their plane.
+    vertices = top.position + top.polygon @ R[:, :2].T
+    gaps = np.linalg.norm(vertices[:, None] - corners, axis=2)
+    assert sorted(set(gaps.argmin(axis=1))) == sorted(gaps.argmin(axis=1))
+    np.testing.assert_allclose(gaps.min(axis=1), 0.0, atol=1e-12)
+    heights = top.height(corners)
+    assert heights.max() < 1e-12
+    assert np.sum(heights > -1e-12) == 4
+    assert top.normal @ (top.position - box.position) > 0
+    # No other face has a normal as upright.
+    assert top.normal[2] == pytest.approx(np.abs(box.rotation[2]).max())
+    np.testing.assert_allclose(vertices.mean(axis=0), top.position, atol=1e-12)
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.1), (0.3, -0.2, 2.5)])
+def test_half_planes_say_what_the_box_frame_says(rpy, rng):
+    box = box_at(rpy)
+    top = box.top
+    local = rng.uniform(-0.6, 0.6, (400, 3))
+    points = box.position + local @ box.rotation.T
+    truth = np.all(np.abs(local[:, :2]) <= box.size[:2] / 2, axis=1)
+    np.testing.assert_array_equal(top.inside(points), truth)
+    assert 0.1 < truth.mean() < 0.9
+    margin = 0.05
+    shrunk = np.all(np.abs(local[:, :2]) <= box.size[:2] / 2 - margin, axis=1)
+    np.testing.assert_array_equal(top.inside(points, margin), shrunk)
+    height = local[:, 2] - box.size[2] / 2
+    np.testing.assert_allclose(top.height(points), height, atol=1e-12)
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.4), (0.3, -0.2, 2.5)])
+def test_half_planes_have_unit_normals_in_the_support(rpy):
+    top = box_at(rpy).top
+    A, b = top.edges()
+    np.testing.assert_allclose(np.linalg.norm(A, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(A @ top.normal, 0.0, atol=1e-12)
+    # Each passes through two neighbouring vertices, the others lie before it.
+    vertices = top.position + top.polygon @ top.rotation[:, :2].T
+    room = b - vertices @ A.T
+    assert room.min() > -1e-12
+    np.testing.assert_array_equal((room < 1e-12).sum(axis=0), 2)
+    # From the middle, the distance to a side is half the length across.
+    np.testing.assert_allclose(sorted(b - A @ top.position), [0.25, 0.25, 0.4, 0.4])
+
+
+def test_a_triangle_is_a_support_as_well():
+    s = support_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    inside = s.position + np.array([0.3, 0.3, 0.0])
+    assert s.inside(inside)
+    assert not s.inside(s.position + np.array([0.6, 0.6, 0.0]))
+    # Incircle of the right triangle: 1 - sqrt(1/2).
+    radius = 1.0 - math.sqrt(0.5)
+    centre = s.position + np.array([radius, radius, 0.0])
+    assert s.inside(centre, radius - 1e-9)
+    assert not s.inside(centre, radius + 1e-9)
+
+
+@pytest.mark.parametrize(
+    "polygon",
+    [
+        SQUARE[::-1],  # clockwise
+        np.array([[0, 0], [2, 0], [2, 2], [1, 0.5]]),  # a dent
+        np.array([[0, 0], [1, 0], [2, 0], [1, 1]]),  # three in a line
+        np.array([[0, 0], [1, 0], [1, 0], [0, 1]]),  # twice the same
+    ],
+)
+def test_a_polygon_that_is_not_convex_and_ccw_is_refused(polygon):
+    with pytest.raises(ValueError, match="convex"):
+        support_of(np.asarray(polygon, dtype=float))
+
+
+def test_arrays_are_copies_and_read_only():
+    size = np.array([1.0, 1.0, 1.0])
+    box = Box(name="b", size=size, position=np.zeros(3), rotation=np.eye(3))
+    size[0] = 9.0
+    assert box.size[0] == 1.0
+    for a in (box.size, box.position, box.rotation, box.top.polygon, box.top.position):
+        with pytest.raises(ValueError, match="read-only"):
+            a[0] = 2.0
+    with pytest.raises(ValueError, match="expected"):
+        Box(name="b", size=np.ones(2), position=np.zeros(3), rotation=np.eye(3))
+
+
+def test_supports_come_ground_first_and_are_found_by_name():
+    scene = Scene.from_height(0.4)
+    assert [s.name for s in scene.supports] == [GROUND, "box"]
+    np.testing.assert_array_equal(scene.support(GROUND).normal, [0, 0, 1])
+    assert scene.support("box").position[2] == pytest.approx(0.4)
+    with pytest.raises(KeyError, match=r"crate.*ground.*box"):
+        scene.support("crate")
+
+
+def test_two_boxes_of_one_name_make_no_scene():
+    with pytest.raises(ValueError, match="unique"):
+        Scene(boxes=(box_at(), box_at()), start=np.zeros(3))
+
+
+# Files.
+
+
+def test_a_file_says_all_there_is_to_say(tmp_path):
+    scene = load_scene(
+        written(
+            tmp_path,
+            """
+ground: {friction: 0.5}
+boxes:
+  - name: table
+    size: [0.95, 0.60, 0.275]
+    position: [0.705, 0.1]
+    rpy: [0.0, 0.0, 0.3]
+    friction: 0.6
+  - {name: shelf, size: [0.2, 0.3, 0.1], position: [2.0, 0.0, 0.5]}
+start: [0.1, 0.2, 0.3]
+goal: [1.6, 0.4, 0.5]
+""",
+        )
+    )
+    table, shelf = scene.boxes
+    assert (scene.ground.friction, table.friction, shelf.friction) == (0.5, 0.6, 0.8)
+    np.testing.assert_allclose(table.position, [0.705, 0.1, 0.1375])  # on the ground
+    np.testing.assert_allclose(shelf.position, [2.0, 0.0, 0.55])  # bottom face at 0.5
+    np.testing.assert_allclose(table.rotation, matrix_from_rpy([0.0, 0.0, 0.3]))
+    np.testing.assert_array_equal(scene.start, [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(scene.goal, [1.6, 0.4, 0.5])
+
+
+def test_what_a_file_leaves_out_has_a_default(tmp_path):
+    scene = load_scene(written(tmp_path, one_box()))
+    np.testing.assert_array_equal(scene.start, 0.0)
+    assert scene.goal is None
+    assert scene.ground.friction == 0.8
+    np.testing.assert_array_equal(scene.boxes[0].rotation, np.eye(3))
+    assert load_scene(written(tmp_path, "start: [1, 2, 0]\n")).boxes == ()
+
+
+def test_a_goal_may_leave_the_yaw_open(tmp_path):
+    scene = load_scene(written(tmp_path, "goal: [1.6, 0.0]\n"))
+    assert scene.goal is not None
+    assert scene.goal.shape == (2,)
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "value", "expected"),
+    [
+        (one_box(size="[1.0, -0.6, 0.275]"), "boxes.0.size.1", "-0.6", "positive"),
+        (one_box(size="[1.0, 0.0, 0.275]"), "boxes.0.size.1", "0.0", "positive"),
+        (one_box(size="[1.0, 0.6, .nan]"), "boxes.0.size.2", "nan", "finite"),
+        (one_box(size="[.inf, 0.6, 0.3]"), "boxes.0.size.0", "inf", "finite"),
+        (one_box(size="[950, 600, 275]"), "boxes.0.size.0", "950", "millimetres"),
+        (one_box(size="[1.0, 0.6]"), "boxes.0.size", None, "missing"),
+        (one_box(size="high"), "boxes.0.size", "high", "tuple"),
+        (one_box(size="[1.0, wide, 1.0]"), "boxes.0.size.1", "wide", "number"),
+        (one_box(position="[730, 0]"), "boxes.0.position", "730", "millimetres"),
+        (one_box(rpy="[90, 0, 0]"), "boxes.0.rpy.0", "90", "radians"),
+        (one_box(friction="-0.1"), "boxes.0.friction", "-0.1", "greater than 0"),
+        (one_box(friction="1.5"), "boxes.0.friction", "1.5", "less than or equal to 1"),
+        (one_box(colour="red"), "boxes.0.colour", "red", "no such field"),
+        (one_box(name="ground"), "boxes", "ground", "different names"),
+        (one_box(name="a/b"), "boxes.0.name", "a/b", "pattern"),
+        (one_box() + one_box()[6:].lstrip("\n"), "boxes", "table", "different names"),
+        ("boxes:\n  - {size: [1, 1, 1], position: [1, 0]}\n", "name", None, "missing"),
+        ("boxes: 3\n", "boxes", "3", "list"),
+        ("ground: {friction: .nan}\n", "ground.friction", "nan", "less than"),
+        ("start: [0.0, 0.0]\n", "start", None, "missing"),
+        ("start: [0.0, .nan, 0.0]\n", "start.1", "nan", "finite"),
+        ("goal: [1600, 0]\n", "goal", "1600", "millimetres"),
+        ("obstacles: []\n", "obstacles", "[]", "no such field"),
+        ("- 1\n- 2\n", None, "list", "mapping"),
+        ("", None, "NoneType", "mapping"),
+        ("boxes: [\n", None, None, "YAML"),
+    ],
+)
+def test_a_mistake_is_named_with_file_field_value_and_what_was_expected(
+    tmp_path, text, field, value, expected
+):
+    file = written(tmp_path, text)
+    with pytest.raises(InputError) as caught:
+        load_scene(file)
+    message = str(caught.value)
+    assert str(file) in message
+    assert expected in message
+    assert "[_finite" not in message  # nothing of how it was checked
+    assert "\n" not in message
+    if field is not None:
+        assert field in message
+    if value is not None:
+        assert value in message
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    missing = tmp_path / "none.yaml"
+    with pytest.raises(InputError, match=r"none\.yaml.*No such file"):
+        load_scene(missing)
+    with pytest.raises(InputError, match="directory"):
+        load_scene(tmp_path)
+    (tmp_path / "image.yaml").write_bytes(b"\x89PNG\xff\xfe\x00")
+    with pytest.raises(InputError, match="YAML"):
+        load_scene(tmp_path / "image.yaml")
