@@ -200,20 +200,43 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     contact = SimpleNamespace(surface="LHand", support="table")
     stance = SimpleNamespace(contacts=(contact,), region="O")
     sequence = SimpleNamespace(stances=(stance,), t=[0.0, 1.5])
-    keyframe = SimpleNamespace(stance=(contact,), com_margin=0.031)
+    state = SimpleNamespace(contact=contact, projected_distance=0.0425)
+    keyframe = SimpleNamespace(
+        contacts=(state,),
+        com_margin=0.031,
+        equilibrium=SimpleNamespace(margin=0.57, limiting="LKneeSag"),
+        method="direct",
+        iterations=14,
+        cost_before=0.805,
+        cost_after=0.125,
+    )
+    move = SimpleNamespace(transition=SimpleNamespace(move="air -> LHand on table"))
     skipped = SimpleNamespace(stance=3, reason="out of reach [0.4 m]")
     plan = SimpleNamespace(
-        keyframes=(keyframe,), skipped=(skipped,), complete=True, trajectory="timed"
+        keyframes=(keyframe, keyframe),
+        paths=(move,),
+        skipped=(skipped,),
+        complete=True,
+        trajectory="timed",
     )
     criterion = SimpleNamespace(value=0.0123, limit=0.05, ok=True)
     verdict = SimpleNamespace(reached=True, criteria={"speed [m/s]": criterion})
-    s = SimpleNamespace(calls=[], plan=plan, verdict=verdict, options=None)
+    s = SimpleNamespace(
+        calls=[], plan=plan, verdict=verdict, options=None, no_opengl=False, timings={}
+    )
 
     def note(name: str, result: object = None) -> None:
         def stage(*args: object, **options: object) -> object:
             s.calls.append(name)
             if name == "plan":
                 s.options = options["options"]
+                options["progress"]("plan", 0.0, "air -> LHand on table")
+                time.sleep(0.03)
+                options["progress"]("trajectory", 1.0, "")
+            if name == "render_run":
+                s.drawing = options
+                if s.no_opengl:
+                    raise clamber.ClamberError("no OpenGL")
             return result
 
         monkeypatch.setitem(vars(clamber), name, stage)
@@ -232,6 +255,9 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         note(name, result)
     for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
         note(name)
+    monkeypatch.setattr(
+        cli, "_save_timings", lambda folder, clock: s.timings.update(clock.stages())
+    )
     return s
 
 
@@ -254,9 +280,53 @@ def test_climb_saves_each_result_before_the_next_stage_begins(stages: SimpleName
     assert stages.options.speed == clamber.PlanOptions().speed
 
 
-def test_climb_draws_nothing_unless_asked(stages: SimpleNamespace):
+def test_climb_draws_pictures_and_a_video_if_asked(stages: SimpleNamespace):
     assert cli.main(["climb", "--quiet"]) == 0
-    assert "render_run" not in stages.calls
+    assert stages.drawing["with_video"] is False
+    assert cli.main(["climb", "--quiet", "--video"]) == 0
+    assert stages.drawing["with_video"] is True
+
+
+def test_a_climb_without_opengl_is_a_climb(
+    stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    stages.no_opengl = True
+    assert cli.main(["climb"]) == 0
+    out, err = capsys.readouterr()
+    assert "the robot made it" in out
+    assert "clamber: no OpenGL" in err
+    assert cli.main(["render", "somewhere"]) == 2
+
+
+def test_each_move_has_its_row_with_figures_and_seconds(
+    stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(["climb"]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    row = next(r for r in rows if r.startswith("air -> LHand on table"))
+    for word in ("direct", "14", "0.03", "0.805", "0.125", "LHand 42", "31", "0.57"):
+        assert word in row
+    assert "LKneeSag" in row
+    assert cli.main(["climb", "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)["keyframes"]
+    assert first["move"] == "start"
+    assert second["projected_distance"] == {"LHand": 0.0425}
+    assert second["seconds"] == pytest.approx(0.03, abs=0.02)
+    assert stages.timings["plan"] == pytest.approx(0.03, abs=0.02)
+
+
+def test_the_clock_adds_up_what_was_tried_again(monkeypatch: pytest.MonkeyPatch):
+    now = iter([0.0, 1.0, 3.0, 6.0, 10.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(now))
+    seen = []
+    clock = cli.Clock()
+    report = clock.watching(lambda *step: seen.append(step))
+    for step in (("a", 0.0), ("b", 0.5), ("a", 0.0), ("b", 0.5)):
+        report("plan", step[1], step[0])
+    report("simulate", 0.0, "")
+    assert len(seen) == 5
+    assert clock.stages() == {"plan": 10.0}
+    assert (clock.of("a"), clock.of("b"), clock.of("c")) == (4.0, 6.0, None)
 
 
 @pytest.mark.parametrize("command", [["climb"], ["simulate", "somewhere"]])
@@ -265,18 +335,32 @@ def test_the_exit_code_is_1_if_the_robot_did_not_make_it(
 ):
     stages.verdict.reached = False
     assert cli.main(command) == 1
-    assert "the robot did not make it" in capsys.readouterr().out
+    assert "the robot did not make it" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_a_plan_without_any_move_is_not_simulated(
     stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ):
-    stages.plan.trajectory = None
+    stages.plan.trajectory, stages.plan.complete = None, False
     assert cli.main(["climb"]) == 1
     assert "simulate" not in stages.calls
-    assert "no move of the sequence could be planned" in capsys.readouterr().out
+    assert "cannot do it, out of reach [0.4 m]" in capsys.readouterr().out
     assert cli.main(["simulate", "somewhere"]) == 1
     assert "simulate" not in stages.calls
+
+
+def test_an_incomplete_plan_gives_the_reason_of_the_first_move_missed(
+    stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
+):
+    merged = SimpleNamespace(stance=5, reason="left leg in the air: of its next move")
+    missed = SimpleNamespace(stance=6, reason="LFoot -> LKnee on table: too high")
+    stages.plan.skipped, stages.plan.complete = (merged, missed), False
+    stages.verdict.reached = False
+    for command in (["climb"], ["plan", "sequence.json"]):
+        assert cli.main(command) == 1
+        last = capsys.readouterr().out.splitlines()[-1]
+        said = "the robot cannot do it, LFoot -> LKnee on table: too high: the files"
+        assert last.startswith(said)
 
 
 def test_the_table_and_the_json_of_a_climb_agree(
@@ -306,6 +390,7 @@ def test_plan_succeeds_only_if_it_is_complete(
     stages.plan.complete = complete
     assert cli.main(["plan", "sequence.json"]) == (0 if complete else 1)
     assert "LHand on table" in capsys.readouterr().out
+    assert stages.calls.index("save_sequence") < stages.calls.index("plan")
     assert "simulate" not in stages.calls
 
 

@@ -35,7 +35,7 @@ from rich.progress import (
 from rich.table import Table
 
 import clamber
-from clamber.errors import ClamberError, InputError, MissingDependency
+from clamber.errors import ClamberError, InputError
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 DEFAULT_HEIGHT = 0.275  # [m] of the box where no scene is given
@@ -79,7 +79,9 @@ class Output:
     def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
         """Print one JSON object, or tables and a closing sentence, on stdout."""
         if self.json:
-            sys.stdout.write(json.dumps({"version": 1, **record}, allow_nan=False) + "\n")
+            sys.stdout.write(
+                json.dumps({"version": 1, **record}, allow_nan=False) + "\n"
+            )
         elif not self.quiet:
             width = None if sys.stdout.isatty() else 140
             console = Console(width=width, highlight=False, markup=False)
@@ -241,9 +243,9 @@ class ClimbCommand:
                     demonstration=(demo, sequence),
                     report=report,
                 )
-            except MissingDependency as e:  # the robot has climbed all the same
+            except ClamberError as e:  # the robot has climbed all the same
                 missing = str(e)
-            clamber.save_timings(folder, clock.stages())
+            _save_timings(folder, clock)
         if missing and not self.output.quiet:
             sys.stderr.write(f"clamber: {missing}\n")
         return _conclude(self.output, folder, plan, verdict, clock)
@@ -324,7 +326,7 @@ class SimulateCommand:
         clock = Clock()
         with self.output.progress() as show:
             verdict = _simulate(plan, self.run_folder, clock.watching(show))
-            clamber.save_timings(self.run_folder, clock.stages())
+            _save_timings(self.run_folder, clock)
         return _conclude(self.output, self.run_folder, plan, verdict)
 
 
@@ -446,6 +448,13 @@ def _simulate(
     return verdict
 
 
+def _save_timings(folder: Path, clock: Clock) -> None:
+    """Add the seconds of the stages that were watched."""
+    from clamber.io import save_timings
+
+    save_timings(folder, clock.stages())
+
+
 def _table(*columns: str) -> Table:
     table = Table(*columns, box=None, header_style="bold", pad_edge=False)
     table.columns[-1].overflow = "fold"
@@ -532,9 +541,7 @@ def _keyframes(record: Mapping[str, Any]) -> Table:
         "CoM [mm]", "push", "limit",
     )  # fmt: skip
     for k in record["keyframes"]:
-        d = " ".join(
-            f"{s} {1000 * x:.0f}" for s, x in k["projected_distance"].items()
-        )
+        d = " ".join(f"{s} {1000 * x:.0f}" for s, x in k["projected_distance"].items())
         com = k["com_margin"]
         table.add_row(
             k["move"],
