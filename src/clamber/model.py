@@ -199,7 +199,7 @@ def _check(robot: Robot, source: Path) -> None:
             )
     for limb in robot.limbs.values():
         for field in ("root", "middle", "end"):
-            if getattr(limb, field) not in bodies | geoms:
+            if getattr(limb, field) not in bodies | geoms | set(robot.surfaces):
                 raise InputError(
                     f"a body or geom of {robot.path.name}",
                     source=source,
@@ -219,6 +219,14 @@ def _check(robot: Robot, source: Path) -> None:
 
 def _bears(geom: str, prefix: str) -> bool:
     return geom == prefix or geom.startswith(prefix + "_")
+
+
+def _renamed(robot: Robot, geom: str) -> str:
+    """Name that a geom of the description has in the world."""
+    for surface, prefix in robot.prefixes.items():
+        if prefix != surface and _bears(geom, prefix):
+            return surface + geom.removeprefix(prefix)
+    return geom
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -304,7 +312,7 @@ class World:
             return b, np.zeros(3)
         if name in self.surfaces:
             return self.surfaces[name].body, self.surfaces[name].centre
-        g = self.model.geom(name).id
+        g = self.model.geom(_renamed(self.robot, name)).id
         return int(self.model.geom_bodyid[g]), self.model.geom_pos[g].copy()
 
 
@@ -342,10 +350,7 @@ def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     if not any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in base.joints):
         base.add_freejoint(name="root")
     for g in spec.geoms:
-        for surface, prefix in robot.prefixes.items():
-            if prefix != surface and _bears(g.name, prefix):
-                g.name = surface + g.name.removeprefix(prefix)
-                break
+        g.name = _renamed(robot, g.name)
     for j in spec.joints:
         if j.type != mujoco.mjtJoint.mjJNT_HINGE:
             continue
@@ -546,8 +551,13 @@ def _stand(
     ends = [robot.limbs[n].end for n in ("left_leg", "right_leg")]
     low, ankles = np.inf, []
     for name in ends:
-        b = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-        ankles.append(data.xpos[b] if b >= 0 else data.geom(name).xpos)
+        if (b := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0:
+            ankles.append(data.xpos[b])
+        elif foot := surfaces.get(name):
+            R_WB = data.xmat[foot.body].reshape(3, 3)
+            ankles.append(data.xpos[foot.body] + R_WB @ foot.centre)
+        else:
+            ankles.append(data.geom(_renamed(robot, name)).xpos)
     for s in surfaces.values():
         z = data.xpos[s.body] + s.corners @ data.xmat[s.body].reshape(3, 3).T
         low = min(low, float(z[:, 2].min() - s.radius))
