@@ -28,7 +28,11 @@ ARC_POINTS = 12  # control points of an arc, its ends included; at least five
 BRIDGE_POINTS = 3  # between shift, touch and keyframe, where nothing moves far
 ARC_WEIGHT = 40.0  # of the arc, against posture 0.08 and constraints
 NODE_ITERATIONS = 25
-DRIFT_TOL = 0.004  # [m] contacts may drift by this between two postures
+BRIDGE_MARGIN = 0.01  # [m] of the centre of mass between two balanced postures
+DRIFT_TOL = 0.002  # [m] contacts that drift by more between two postures refine them
+DRIFT_LIMIT = 0.01  # [m] at most, anywhere on the path
+OVERLAP_TOL = 0.001  # [m] links that enter another by more refine the path
+OVERLAP_LIMIT = 0.004  # [m] at most, anywhere on the path
 MAX_REFINEMENTS = 3  # halvings between two postures
 
 
@@ -110,18 +114,15 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
             taken as it is, for comparison.
     """
     t = transition
-    names = tuple(c.surface for c in t.held)
-    before = (*t.held, *t.leaving)
-    after = names + ((t.move.makes.surface,) if t.move.makes else ())
+    before, made = (*t.held, *t.leaving), t.held
+    if t.move.makes:
+        made = (*t.held, t.move.makes)
     closed = (*t.held, *t.rolling)
-    shift = _bridge(ik, t.before, t.shifted, closed, tuple(c.surface for c in before))
     swing, control = _swing(ik, t, adapt)
-    made = (*t.held, t.move.makes) if t.move.makes else t.held
-    settle = _bridge(ik, t.touching, t.after, made, after)
     phases = (
         Phase(
             kind="shift",
-            q=shift,
+            q=_bridge(ik, t.before, t.shifted, closed, before),
             contacts=closed,
             load_before=before,
             load_after=t.held,
@@ -135,7 +136,11 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
             arc=control,
         ),
         Phase(
-            kind="settle", q=settle, contacts=made, load_before=t.held, load_after=made
+            kind="settle",
+            q=_bridge(ik, t.touching, t.after, made, made),
+            contacts=made,
+            load_before=t.held,
+            load_after=made,
         ),
     )
     status, note = check_phases(ik, phases, t)
@@ -147,38 +152,31 @@ def interpolate(kin: Kinematics, a: np.ndarray, b: np.ndarray, s: float) -> np.n
     return kin.integrate(a, s * kin.difference(a, b))
 
 
-def _bridge_problem(
-    world: World, contacts: tuple[Contact, ...], loaded: tuple[str, ...], q: np.ndarray
-) -> PostureProblem:
-    problem = balance_problem(
-        world,
-        held=tuple(c for c in contacts if c.surface in loaded),
-        closed=tuple(c for c in contacts if c.surface not in loaded),
-        q_reference=q,
-        posture_weight=1.0,
-    )
-    return replace(problem, ellipse_weight=0.0, com_weight=0.0, balance_margin=0.01)
-
-
 def _bridge(
     ik: IK,
     a: np.ndarray,
     b: np.ndarray,
     contacts: tuple[Contact, ...],
-    loaded: tuple[str, ...],
+    loaded: tuple[Contact, ...],
 ) -> np.ndarray:
-    """Postures from `a` to `b` with all contacts closed."""
+    """Postures from `a` to `b` with all contacts closed, near the straight way."""
+    bearing = {c.surface for c in loaded}
 
-    def between(q: np.ndarray) -> np.ndarray:
-        return ik.solve(
-            _bridge_problem(ik.world, contacts, loaded, q),
-            q,
-            iterations=NODE_ITERATIONS,
-        ).q
+    def node(share: float, last: np.ndarray) -> np.ndarray:
+        q = interpolate(ik.kin, a, b, share)
+        problem = balance_problem(
+            ik.world,
+            held=tuple(c for c in contacts if c.surface in bearing),
+            closed=tuple(c for c in contacts if c.surface not in bearing),
+            q_reference=q,
+            posture_weight=1.0,
+        )
+        problem = replace(
+            problem, ellipse_weight=0.0, com_weight=0.0, balance_margin=BRIDGE_MARGIN
+        )
+        return _solve_node(ik, problem, q, last)
 
-    n = BRIDGE_POINTS + 1
-    nodes = [a, *(between(interpolate(ik.kin, a, b, i / n)) for i in range(1, n)), b]
-    return _refine(ik, nodes, contacts, between)
+    return _fill(ik, a, b, BRIDGE_POINTS + 2, node, contacts, ())
 
 
 def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -186,28 +184,27 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
     world, kin = ik.world, ik.kin
     made = t.move.makes
     if made is None:
-        return _free_swing(ik, t), np.zeros((0, 3))
+        return _bridge(ik, t.shifted, t.touching, t.held, t.held), np.zeros((0, 3))
     kin.update(t.shifted)
     support = world.supports[made.support]
     p1 = kin.contact_point(made.surface, support.normal)
-    was_on_top = any(
+    slides = any(
         c.surface == made.surface and c.support == made.support for c in t.leaving
     )
-    control = arc(p1, made.position, support.position[2], was_on_top, ARC_POINTS)
+    control = arc(p1, made.position, support.position[2], slides, ARC_POINTS)
+    shares = np.linspace(0.0, 1.0, len(control))
     rotation = support_rotation(support, made.quaternion)
-    nodes = [t.shifted]
-    q = t.shifted
-    n = len(control) - 1
-    for i in range(1, n):
-        reference = interpolate(kin, t.shifted, t.touching, i / n)
+
+    def node(share: float, last: np.ndarray) -> np.ndarray:
         goal = ContactGoal(
             surface=made.surface,
             support=made.support,
-            position=control[i],
+            position=np.array([np.interp(share, shares, x) for x in control.T]),
             rotation=rotation,
             hard=False,
             reference=ARC_WEIGHT,
         )
+        reference = interpolate(kin, t.shifted, t.touching, share)
         problem = balance_problem(
             world,
             held=t.held,
@@ -215,15 +212,18 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
             extra=(goal,),
             posture_weight=0.3,
         )
-        problem = replace(
-            problem, clearance=_swing_clearance(ik, problem.clearance, t, i / n)
-        )
         if not adapt:
-            problem = replace(problem, clearance=np.full(len(world.pairs), -np.inf))
-        q = ik.solve(problem, q, iterations=NODE_ITERATIONS).q
-        nodes.append(q)
-    nodes.append(t.touching)
-    return np.array(nodes), control
+            nothing = np.full(len(world.pairs), -np.inf)
+            free = replace(problem, clearance=nothing)
+            return ik.solve(free, last, iterations=NODE_ITERATIONS).q
+        clearance = _swing_clearance(ik, problem.clearance, t, share)
+        problem = replace(problem, clearance=clearance)
+        return _solve_node(ik, problem, last, reference)
+
+    moving = (*(c.surface for c in t.leaving), made.surface)
+    n = len(control)
+    q = _fill(ik, t.shifted, t.touching, n, node, t.held, moving, refine=adapt)
+    return q, control
 
 
 def _swing_clearance(
@@ -234,101 +234,124 @@ def _swing_clearance(
     At lift-off and touch-down the limb is as near to the supports as the end postures
     are; asking for the full distance at once would tear it off them sideways.
     """
-    out = clearance
-    kin = ik.kin
     ramp = min(1.0, 5.0 * s, 5.0 * (1.0 - s))
     if ramp >= 1.0:
-        return out
-    kin.update(t.shifted if s < 0.5 else t.touching)
-    near = kin.proximity(CLEARANCE, None)
-    out = out.copy()
-    floor = np.minimum(near.distance, CLEARANCE)
-    finite = np.isfinite(out[near.pairs])
-    k = near.pairs[finite]
-    out[k] = np.minimum(
-        out[k], np.maximum(floor[finite], 0.0) * (1 - ramp) + ramp * CLEARANCE
-    )
+        return clearance
+    ik.kin.update(t.shifted if s < 0.5 else t.touching)
+    near = ik.kin.proximity(CLEARANCE, np.isfinite(clearance))
+    floor = np.clip(near.distance, 0.0, CLEARANCE)
+    out = clearance.copy()
+    eased = floor * (1 - ramp) + ramp * CLEARANCE
+    out[near.pairs] = np.minimum(out[near.pairs], eased)
     return out
 
 
-def _free_swing(ik: IK, t: Transition) -> np.ndarray:
-    """A contact is only broken: straight to the next posture, clear of everything."""
-
-    def between(q: np.ndarray) -> np.ndarray:
-        problem = _bridge_problem(ik.world, t.held, tuple(c.surface for c in t.held), q)
-        return ik.solve(problem, q, iterations=NODE_ITERATIONS).q
-
-    n = 5
-    nodes = [t.shifted]
-    nodes += [
-        between(interpolate(ik.kin, t.shifted, t.touching, i / n)) for i in range(1, n)
-    ]
-    nodes.append(t.touching)
-    return _refine(ik, nodes, t.held, between)
-
-
-def _drift(ik: IK, q: np.ndarray, contacts: tuple[Contact, ...]) -> float:
-    """Largest distance of a contact from where it should be at `q` [m]."""
-    ik.kin.update(q)
-    return max((contact_drift(ik.kin, c) for c in contacts), default=0.0)
-
-
-def _refine(
-    ik: IK,
-    nodes: list[np.ndarray],
-    contacts: tuple[Contact, ...],
-    between: Callable[[np.ndarray], np.ndarray],
+def _solve_node(
+    ik: IK, problem: PostureProblem, q: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """Halve the gaps in whose middle a contact has drifted."""
-    for _ in range(MAX_REFINEMENTS):
+    """Solve from `q`; where that stalls, the better of that and from `other`."""
+    first = ik.solve(problem, q, iterations=NODE_ITERATIONS)
+    if first.status is Status.SOLVED:
+        return first.q
+    second = ik.solve(problem, other)
+    return min((first, second), key=lambda s: s.residuals.worst).q
+
+
+def _fill(
+    ik: IK,
+    a: np.ndarray,
+    b: np.ndarray,
+    points: int,
+    node: Callable[[float, np.ndarray], np.ndarray],
+    contacts: tuple[Contact, ...],
+    moving: tuple[str, ...],
+    *,
+    refine: bool = True,
+) -> np.ndarray:
+    """(n, nq) postures from `a` to `b`, closer together where it matters.
+
+    A gap is halved while, in its middle, a contact has drifted or links overlap.
+
+    Args:
+        ik: Workspace.
+        a: (nq,) first posture.
+        b: (nq,) last posture.
+        points: Number of postures to begin with, ends included.
+        node: Posture at a share of the way, given the one before.
+        contacts: Closed all the way.
+        moving: Surfaces that may touch any support.
+        refine: Halve gaps at all.
+    """
+    watched = watched_pairs(ik.world, contacts, moving)
+    nodes = [(0.0, a)]
+    for share in np.linspace(0.0, 1.0, points)[1:-1]:
+        nodes.append((float(share), node(float(share), nodes[-1][1])))
+    nodes.append((1.0, b))
+    for _ in range(MAX_REFINEMENTS if refine else 0):
         out = [nodes[0]]
-        for a, b in itertools.pairwise(nodes):
-            mid = interpolate(ik.kin, a, b, 0.5)
-            if _drift(ik, mid, contacts) > DRIFT_TOL:
-                out.append(between(mid))
-            out.append(b)
+        for (s0, q0), (s1, q1) in itertools.pairwise(nodes):
+            middle = interpolate(ik.kin, q0, q1, 0.5)
+            depth, _ = overlap(ik, middle, watched)
+            if _drift(ik, contacts) > DRIFT_TOL or depth > OVERLAP_TOL:
+                share = 0.5 * (s0 + s1)
+                out.append((share, node(share, q0)))
+            out.append((s1, q1))
         if len(out) == len(nodes):
             break
         nodes = out
-    return np.array(nodes)
+    return np.array([q for _, q in nodes])
+
+
+def watched_pairs(
+    world: World, contacts: tuple[Contact, ...], moving: tuple[str, ...]
+) -> np.ndarray:
+    """(P,) bool: pairs that must not overlap while these surfaces touch supports."""
+    out = np.ones(len(world.pairs), bool)
+    touching = {c.surface: [world.support_geom[c.support]] for c in contacts}
+    touching |= {s: list(world.support_geom.values()) for s in moving}
+    for surface, supports in touching.items():
+        mine = np.isin(world.pairs, world.surfaces[surface].geoms).any(axis=1)
+        out &= ~(mine & np.isin(world.pairs, supports).any(axis=1))
+    return out
+
+
+def overlap(ik: IK, q: np.ndarray, watched: np.ndarray) -> tuple[float, int]:
+    """Deepest overlap at `q` [m] among the watched pairs, and which pair; 0, -1: none.
+
+    Leaves the kinematics at `q`.
+    """
+    ik.kin.update(q)
+    near = ik.kin.proximity(0.0, watched)
+    if len(near.distance) == 0:
+        return 0.0, -1
+    i = int(np.argmin(near.distance))
+    return -float(near.distance[i]), int(near.pairs[i])
+
+
+def _drift(ik: IK, contacts: tuple[Contact, ...]) -> float:
+    """Largest distance of a contact from its place at the present posture [m]."""
+    return max((contact_drift(ik.kin, c) for c in contacts), default=0.0)
 
 
 def check_phases(
     ik: IK, phases: tuple[Phase, ...], t: Transition
 ) -> tuple[Status, str]:
-    """Distances and contacts at all postures and half-way between, solver aside."""
+    """Overlaps and contacts at all postures and half-way between, solver aside."""
     kin, world = ik.kin, ik.world
     worst, note = 0.0, ""
-    moving = {s: None for s in t.move.breaks}
-    if t.move.makes:
-        moving[t.move.makes.surface] = None
-    geoms = [g for s in moving for g in world.surfaces[s].geoms]
+    moving = t.move.breaks + ((t.move.makes.surface,) if t.move.makes else ())
     for phase in phases:
-        where = {c.surface: c.support for c in phase.contacts}
-        skip = np.zeros(len(world.pairs), bool)
-        for surface, support in where.items():
-            mine = np.isin(world.pairs, world.surfaces[surface].geoms).any(axis=1)
-            skip |= mine & (world.pairs == world.support_geom[support]).any(axis=1)
-        skip |= np.isin(world.pairs, geoms).any(axis=1) & np.isin(
-            world.pairs, list(world.support_geom.values())
-        ).any(axis=1)
-        for a, b in zip(phase.q, phase.q[1:], strict=False):
+        watched = watched_pairs(world, phase.contacts, moving)
+        for a, b in itertools.pairwise(phase.q):
             for q in (interpolate(kin, a, b, 0.5), b):
-                kin.update(q)
-                near = kin.proximity(0.0, ~skip)
-                if len(near.distance) and -near.distance.min() > worst:
-                    i = int(np.argmin(near.distance))
-                    worst = -float(near.distance[i])
-                    pair = [
-                        world.model.geom(int(g)).name
-                        for g in world.pairs[near.pairs[i]]
-                    ]
-                    depth = f"{1e3 * worst:.1f} mm ({phase.kind})"
-                    note = f"{' and '.join(pair)} overlap by {depth}"
-                drift = _drift(ik, q, phase.contacts)
-                if drift > 0.02:
-                    return (
-                        Status.UNREACHABLE,
-                        f"contact open by {1e3 * drift:.0f} mm ({phase.kind})",
-                    )
-    return (Status.COLLIDING, note) if worst > 0.004 else (Status.SOLVED, note)
+                depth, pair = overlap(ik, q, watched)
+                if depth > worst:
+                    worst = depth
+                    names = [world.model.geom(int(g)).name for g in world.pairs[pair]]
+                    where = f"{1e3 * depth:.1f} mm ({phase.kind})"
+                    note = f"{' and '.join(names)} overlap by {where}"
+                drift = _drift(ik, phase.contacts)
+                if drift > DRIFT_LIMIT:
+                    where = f"{1e3 * drift:.0f} mm ({phase.kind})"
+                    return Status.UNREACHABLE, f"a contact opens by {where}"
+    return (Status.COLLIDING if worst > OVERLAP_LIMIT else Status.SOLVED), note

@@ -172,7 +172,8 @@ def _profile(length: float, cruise: float) -> np.ndarray:
         cruise = length / ramp
     total = max(length / cruise + ramp, MIN_PHASE, 2 * ramp)
     n = int(np.ceil(total * RATE))
-    t = np.arange(1, n + 1) / n * total
+    total = n / RATE  # a whole number of samples, else ds/dt is not the derivative
+    t = np.arange(1, n + 1) / RATE
 
     def rise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x = np.clip(x, 0.0, ramp)
