@@ -1,0 +1,280 @@
+"""The timed reference: smooth, exact, within limits, and balanced by its torques."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from clamber.posture.keyframe import bearing_frames
+from clamber.statics import cone_generators
+from clamber.trajectory import (
+    BASE_LENGTH,
+    HOLD_END,
+    HOLD_START,
+    RATE,
+    build_trajectory,
+    holding_torque,
+    phase_torques,
+)
+
+
+@pytest.fixture(scope="module")
+def knee_phases(demo_plan):
+    """Shift, swing and settle of the left knee."""
+    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.move.breaks)
+    return path.phases
+
+
+def velocity_errors(kin, trajectory, step: int) -> np.ndarray:
+    """Central differences over `step` samples either side, against v."""
+    T = len(trajectory.time)
+    return np.array(  # the same samples for every step
+        [
+            np.abs(
+                kin.difference(trajectory.q[k - step], trajectory.q[k + step])
+                * (RATE / (2 * step))
+                - trajectory.v[k]
+            ).max()
+            for k in range(50, T - 50, 53)
+        ]
+    )
+
+
+def test_samples_are_a_millisecond_apart(demo_plan):
+    time = demo_plan.trajectory.time
+    assert np.allclose(np.diff(time), 1e-3, atol=1e-12)
+    assert time[0] == 0.0
+
+
+def test_velocity_is_the_derivative_on_the_manifold(demo_plan):
+    assert demo_plan.trajectory.velocity_error(demo_plan.world) < 1e-5
+
+
+def test_difference_quotients_converge_to_the_velocity_with_second_order(
+    demo_plan, demo_kinematics
+):
+    # An exact derivative: four times the step, sixteen times the error.
+    near = velocity_errors(demo_kinematics, demo_plan.trajectory, 4)
+    far = velocity_errors(demo_kinematics, demo_plan.trajectory, 16)
+    moving = (far > 1e-6) & (near > 1e-8)
+    assert np.median(far[moving] / near[moving]) == pytest.approx(16, rel=0.1)
+
+
+def test_velocity_error_sees_a_velocity_in_the_wrong_frame(demo_plan, demo_kinematics):
+    """The base's angular velocity is in its own frame; in the world's it is wrong."""
+    trajectory = demo_plan.trajectory
+    wrong = trajectory.v.copy()
+    for k in range(len(wrong)):
+        demo_kinematics.data.qpos[:] = trajectory.q[k]
+        w, x, y, z = trajectory.q[k, 3:7]
+        R = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        wrong[k, 3:6] = R @ wrong[k, 3:6]
+    assert replace(trajectory, v=wrong).velocity_error(demo_plan.world) > 0.01
+
+
+def test_velocity_integrates_to_the_last_posture(demo_plan, demo_kinematics):
+    trajectory = demo_plan.trajectory
+    q = trajectory.q[0].copy()
+    for a, b in itertools.pairwise(trajectory.v):
+        q = demo_kinematics.integrate(q, 0.5 * (a + b) / RATE)
+    assert np.abs(demo_kinematics.difference(q, trajectory.q[-1])).max() < 1e-5
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.3, 1.0])
+def test_no_joint_is_faster_than_the_limit_and_the_fastest_reaches_it(
+    demo_plan, knee_phases, speed
+):
+    trajectory = build_trajectory(demo_plan.world, knee_phases, speed=speed)
+    fastest = np.abs(trajectory.v[:, 6:]).max()
+    assert fastest <= speed * 1.005
+    if speed < 0.5:  # at 1 rad/s the phases are too short to cruise
+        scaled = np.abs(trajectory.v).copy()
+        scaled[:, :3] /= BASE_LENGTH
+        assert scaled.max() >= 0.95 * speed
+
+
+def test_half_the_speed_takes_about_twice_as_long(demo_plan, knee_phases):
+    fast, slow = (
+        build_trajectory(demo_plan.world, knee_phases, speed=s).time[-1]
+        - HOLD_START
+        - HOLD_END
+        for s in (0.1, 0.05)
+    )
+    assert 1.7 < slow / fast < 2.0  # ramps and rests do not scale
+
+
+def test_a_joint_with_a_lower_speed_limit_of_its_own_keeps_it(demo_plan, knee_phases):
+    world = demo_plan.world
+    free = build_trajectory(world, knee_phases, speed=0.3)
+    dof = 6 + int(np.argmax(np.abs(free.v[:, 6:]).max(axis=0)))
+    v_max = world.v_max.copy()
+    v_max[dof] = 0.1
+    slow = build_trajectory(replace(world, v_max=v_max), knee_phases, speed=0.3)
+    assert np.abs(slow.v[:, dof]).max() <= 0.1 * 1.005
+    assert np.abs(free.v[:, dof]).max() > 0.25
+
+
+def test_it_starts_and_ends_at_rest(demo_plan):
+    trajectory = demo_plan.trajectory
+    start, end = round(HOLD_START * RATE), round(HOLD_END * RATE)
+    assert not trajectory.v[:start].any()
+    assert not trajectory.v[-end:].any()
+    assert np.ptp(trajectory.q[-end:], axis=0).max() == 0.0
+
+
+def test_it_is_at_rest_wherever_contacts_change(demo_plan):
+    trajectory = demo_plan.trajectory
+    changes = 1 + np.flatnonzero(np.diff(trajectory.contact, axis=0).any(axis=1))
+    assert len(changes) >= 2 * len(demo_plan.paths) - 2
+    for k in changes:
+        assert not trajectory.v[k - 1].any()
+        assert np.abs(trajectory.v[k]).max() < 1e-3
+
+
+def test_velocity_has_no_jumps(demo_plan):
+    # Speed times the profile's acceleration, and what the spline bends by itself.
+    steps = np.abs(np.diff(demo_plan.trajectory.v, axis=0)).max() * RATE
+    assert steps < 10.0  # [rad/s^2]
+
+
+def test_joint_limits_are_respected_at_every_sample(demo_plan):
+    world, q = demo_plan.world, demo_plan.trajectory.q[:, demo_plan.world.qadr]
+    over = np.maximum(world.q_min[world.dadr] - q, q - world.q_max[world.dadr])
+    assert over.max() < 5e-3
+
+
+def test_base_quaternions_are_unit_and_never_jump_to_the_other_sign(demo_plan):
+    quat = demo_plan.trajectory.q[:, 3:7]
+    assert np.abs(np.linalg.norm(quat, axis=1) - 1.0).max() < 1e-12
+    assert np.sum(quat[1:] * quat[:-1], axis=1).min() > 0.999
+
+
+def test_it_passes_through_every_posture_of_every_path_in_order(
+    demo_plan, demo_kinematics
+):
+    trajectory, k = demo_plan.trajectory, 0
+    for path in demo_plan.paths:
+        for phase in path.phases:
+            for node in phase.q:
+                window = trajectory.q[k : k + 8000]
+                far = np.abs(window[:, 7:] - node[7:]).max(axis=1)
+                # within half a sample's way at the speed limit
+                first = int(np.flatnonzero(far < 1.6e-4)[0])
+                k += first
+                d = demo_kinematics.difference(trajectory.q[k], node)
+                assert np.abs(d).max() < 2e-3
+    assert k <= len(trajectory.time)
+
+
+def test_keyframes_are_reached_at_their_times(demo_plan):
+    trajectory = demo_plan.trajectory
+    assert len(trajectory.keyframes) == len(demo_plan.keyframes)
+    assert np.all(np.diff(trajectory.keyframes) > 0)
+    for t, key in zip(trajectory.keyframes, demo_plan.keyframes, strict=True):
+        assert np.allclose(trajectory.q[trajectory.at(t)], key.q, atol=1e-9)
+
+
+def test_at_is_clipped_to_the_ends(demo_plan):
+    trajectory = demo_plan.trajectory
+    assert trajectory.at(-1.0) == 0
+    assert trajectory.at(1e6) == len(trajectory.time) - 1
+    assert trajectory.at(0.5) == 500
+
+
+def test_contact_flags_follow_the_stances(demo_plan):
+    trajectory = demo_plan.trajectory
+    for t, key in zip(trajectory.keyframes, demo_plan.keyframes, strict=True):
+        flags = trajectory.contact[trajectory.at(t)]
+        closed = {s for s, on in zip(trajectory.surfaces, flags, strict=True) if on}
+        assert closed == {c.surface for c in key.stance}
+
+
+def test_the_moving_surface_is_open_while_it_swings(demo_plan, knee_phases):
+    trajectory = build_trajectory(demo_plan.world, knee_phases, speed=0.3)
+    foot, knee = (trajectory.surfaces.index(n) for n in ("LFoot", "LKnee"))
+    changes = np.flatnonzero(np.diff(trajectory.contact, axis=0).any(axis=1))
+    lift, land = changes
+    assert trajectory.contact[: lift + 1, foot].all()
+    assert not trajectory.contact[lift + 1 :, foot].any()
+    assert not trajectory.contact[: land + 1, knee].any()
+    assert trajectory.contact[land + 1 :, knee].all()
+
+
+def unbalanced(kin, q, contacts, tau) -> tuple[float, float]:
+    """Least |J' f + S' tau - g| over forces in the friction cones, base and joints."""
+    world = kin.world
+    kin.update(q)
+    names, points, normals, mu = bearing_frames(kin, contacts)
+    cones = cone_generators(normals, mu, 16)
+    columns = [
+        kin.point_jacobian(world.surfaces[n].body, p).T @ g.T
+        for n, p, g in zip(names, points, cones, strict=True)
+    ]
+    wanted = kin.gravity()
+    wanted[world.dadr] -= tau
+    A = np.concatenate(columns, axis=1)
+    left = A @ nnls(A, wanted)[0] - wanted
+    return float(np.abs(left[:6]).max()), float(np.abs(left[6:]).max())
+
+
+def test_holding_torques_and_forces_in_the_cones_balance_gravity(
+    demo_plan, demo_kinematics
+):
+    for key in demo_plan.keyframes:
+        tau = holding_torque(demo_kinematics, key.q, key.stance)
+        base, joints = unbalanced(demo_kinematics, key.q, key.stance, tau)
+        assert base < 1e-2  # [N, N m] of 300 N
+        assert joints < 1e-2
+
+
+def test_wrong_torques_balance_nothing(demo_plan, demo_kinematics):
+    key = demo_plan.keyframes[-1]
+    tau = holding_torque(demo_kinematics, key.q, key.stance)
+    _, joints = unbalanced(demo_kinematics, key.q, key.stance, -tau)
+    assert joints > 0.1
+
+
+def test_feed_forward_hands_the_load_over_from_old_to_new_contacts(
+    demo_kinematics, knee_phases
+):
+    shift, swing, settle = knee_phases
+    kin = demo_kinematics
+    for phase in knee_phases:
+        tau = phase_torques(kin, phase)
+        first = holding_torque(kin, phase.q[0], phase.load_before)
+        last = holding_torque(kin, phase.q[-1], phase.load_after)
+        assert np.allclose(tau[0], first, atol=1e-9)
+        assert np.allclose(tau[-1], last, atol=1e-9)
+    assert shift.load_after == swing.load_before == settle.load_before
+
+
+def test_feed_forward_torques_are_continuous_and_within_effort_limits(demo_plan):
+    tau = demo_plan.trajectory.tau
+    assert np.all(np.abs(tau) <= demo_plan.world.tau_max + 1e-9)
+    assert np.abs(np.diff(tau, axis=0)).max() < 0.2  # [N m] in a millisecond
+
+
+def test_phases_that_do_not_join_are_refused(demo_plan, knee_phases):
+    shift, _, settle = knee_phases
+    with pytest.raises(ValueError, match="does not begin where the last one ended"):
+        build_trajectory(demo_plan.world, (shift, settle), speed=0.3)
+
+
+def test_arrays_of_different_length_are_refused(demo_plan):
+    with pytest.raises(ValueError, match="tau has"):
+        replace(demo_plan.trajectory, tau=demo_plan.trajectory.tau[:-1])
+
+
+def test_arrays_are_read_only(demo_plan):
+    with pytest.raises(ValueError, match="read-only"):
+        demo_plan.trajectory.q[0, 0] = 1.0
