@@ -1,0 +1,289 @@
+"""Moving one contact: weight shifted first, the new contact closed before it bears."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clamber.contact import Contact
+from clamber.errors import Status
+from clamber.posture.ik import IK
+from clamber.posture.keyframe import bearing_frames, contact_drift, equilibrium_at
+from clamber.se3 import matrix_from_rpy
+from clamber.statics import com_margin, support_ellipse, support_polygon
+from clamber.transition import (
+    BALANCE_MARGIN,
+    REACH_ANGLE,
+    approach_contact,
+    balance_problem,
+    lean_direction,
+    plan_transition,
+    reach_to_support,
+    rolled,
+)
+
+UP = np.array([0.0, 0.0, 1.0])
+AHEAD = np.array([1.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def transitions(demo_plan):
+    return [p.transition for p in demo_plan.paths]
+
+
+@pytest.fixture(scope="module")
+def ik(demo_plan):
+    return IK(demo_plan.world)
+
+
+def polygon_of(kin, contacts) -> np.ndarray:
+    """Support polygon of contacts at the present posture."""
+    return support_polygon(bearing_frames(kin, contacts)[1][:, :2])
+
+
+# The orientation of reach-to-support (4.26, 4.27).
+
+
+def test_reach_to_support_is_25_degrees_along_the_way_back():
+    p1, p2 = np.array([0.1, 0.2, 0.0]), np.array([0.4, -0.2, 1.2])
+    angles = reach_to_support(p1, p2, np.eye(3))
+    assert np.allclose(angles, np.radians(25) * np.array([-0.3, 0.4, -1.2]) / 1.3)
+
+
+def test_reach_to_support_is_expressed_in_the_pelvis_frame(rng):
+    p1, p2 = rng.normal(size=3), rng.normal(size=3)
+    R = matrix_from_rpy(rng.uniform(-1, 1, 3))
+    in_world = R @ reach_to_support(p1, p2, R)
+    assert np.allclose(in_world, reach_to_support(p1, p2, np.eye(3)))
+    assert np.linalg.norm(in_world) == pytest.approx(REACH_ANGLE)
+
+
+def test_turning_the_world_does_not_change_what_the_pelvis_sees(rng):
+    for _ in range(20):
+        p1, p2, rpy, turn = rng.uniform(-1, 1, (4, 3))
+        R, Q = matrix_from_rpy(rpy), matrix_from_rpy(np.pi * turn)
+        assert np.allclose(
+            reach_to_support(Q @ p1, Q @ p2, Q @ R), reach_to_support(p1, p2, R)
+        )
+
+
+def test_a_contact_that_does_not_move_asks_for_no_turn():
+    p = np.array([0.3, 0.1, 0.2])
+    assert not reach_to_support(p, p, np.eye(3)).any()
+    assert np.allclose(lean_direction(p, p, np.eye(3)), UP)
+
+
+def test_the_lean_points_from_the_new_contact_to_where_it_comes_from(rng):
+    for _ in range(50):
+        p1, p2 = rng.uniform(-0.5, 0.5, (2, 3))
+        yaw = matrix_from_rpy([0, 0, rng.uniform(-3, 3)])
+        lean, back = lean_direction(p1, p2, yaw), (p1 - p2)[:2]
+        assert np.linalg.norm(lean) == pytest.approx(1.0)
+        # sin(phi x) and sin(phi y) against x and y: parallel but for curvature
+        cosine = lean[:2] @ back / np.linalg.norm(lean[:2]) / np.linalg.norm(back)
+        assert cosine > 0.999
+
+
+def test_the_lean_is_at_most_phi(rng):
+    level = lean_direction(np.zeros(3), np.array([1.0, 0.0, 0.0]), np.eye(3))
+    assert np.arccos(level[2]) == pytest.approx(REACH_ANGLE)
+    for p1, p2, rpy in rng.uniform(-1, 1, (200, 3, 3)):
+        lean = lean_direction(p1, p2, matrix_from_rpy(rpy))
+        # Two angles whose sines are added: half a degree more on the diagonal.
+        assert np.arccos(lean[2]) < REACH_ANGLE + np.radians(0.5)
+
+
+def test_the_lean_turns_with_the_world(rng):
+    p1, p2, rpy = rng.uniform(-1, 1, (3, 3))
+    R, Q = matrix_from_rpy(rpy), matrix_from_rpy([0, 0, 1.1])
+    assert np.allclose(
+        lean_direction(Q @ p1, Q @ p2, Q @ R), Q @ lean_direction(p1, p2, R)
+    )
+
+
+# The postures of every move of the demonstration.
+
+
+def test_every_move_of_the_demonstration_has_solved_transitions(transitions):
+    assert [t.status for t in transitions] == [Status.SOLVED] * 6
+
+
+@pytest.mark.parametrize("posture", ["shifted", "touching"])
+def test_the_centre_of_mass_is_inside_the_polygon_of_the_contacts_that_stay(
+    transitions, demo_kinematics, posture
+):
+    for t in transitions:
+        demo_kinematics.update(getattr(t, posture))
+        margin = com_margin(demo_kinematics.com, polygon_of(demo_kinematics, t.held))
+        assert margin >= BALANCE_MARGIN - 2e-3
+
+
+@pytest.mark.parametrize("posture", ["shifted", "touching"])
+def test_forces_on_the_contacts_that_stay_hold_the_robot_alone(
+    transitions, demo_kinematics, posture
+):
+    for t in transitions:
+        demo_kinematics.update(getattr(t, posture))
+        assert equilibrium_at(demo_kinematics, t.held).feasible
+
+
+def test_before_the_shift_some_move_could_not_do_without_its_contact(
+    transitions, demo_kinematics
+):
+    """Else shifting the weight would prove nothing."""
+    margins = []
+    for t in transitions:
+        demo_kinematics.update(t.before)
+        polygon = polygon_of(demo_kinematics, t.held)
+        margins.append(com_margin(demo_kinematics.com, polygon))
+    assert min(margins) < 0.0
+
+
+def test_while_the_weight_shifts_all_old_contacts_stay_closed(
+    transitions, demo_kinematics
+):
+    for t in transitions:
+        demo_kinematics.update(t.shifted)
+        for c in (*t.held, *t.rolling):
+            assert contact_drift(demo_kinematics, c) < 1e-3
+
+
+def test_the_new_contact_touches_while_those_that_stay_are_closed(
+    transitions, demo_kinematics
+):
+    for t in transitions:
+        demo_kinematics.update(t.touching)
+        for c in (*t.held, t.move.makes):
+            assert contact_drift(demo_kinematics, c) < 1e-3
+            support = demo_kinematics.world.supports[c.support]
+            points = demo_kinematics.bearing_points(c.surface, support.normal, c.edge)
+            assert np.abs(support.height(points)).max() < 1e-3
+            assert support.inside(points).all()
+
+
+def test_transitions_lead_from_keyframe_to_keyframe(demo_plan, transitions):
+    for t, a, b in zip(
+        transitions, demo_plan.keyframes, demo_plan.keyframes[1:], strict=False
+    ):
+        assert np.array_equal(t.before, a.q)
+        assert np.array_equal(t.after, b.q)
+        names = {c.surface for c in t.held}
+        assert names | {t.move.makes.surface} == {c.surface for c in b.stance}
+        assert names | {c.surface for c in t.leaving} == {c.surface for c in a.stance}
+
+
+def test_a_worse_posture_is_named(demo_plan, ik):
+    """A contact out of reach: the transition says so instead of pretending."""
+    before, after = demo_plan.keyframes[1:3]
+    move = demo_plan.paths[1].transition.move
+    far = replace(move.makes, position=move.makes.position + 0.6 * AHEAD)
+    states = tuple(
+        replace(s, contact=far) if s.contact.surface == far.surface else s
+        for s in after.contacts
+    )
+    t = plan_transition(ik, before, replace(after, contacts=states), move)
+    assert t.status is Status.UNREACHABLE
+    assert t.residuals.contact > 0.01
+
+
+# Feet that are about to leave.
+
+
+def test_a_foot_rolls_onto_its_toes_where_the_others_are_ahead(ik, demo_plan):
+    home = demo_plan.keyframes[0]
+    foot = home.stance[0]
+    tiptoe = rolled(ik, home.q, foot, foot.position + 0.4 * AHEAD)
+    edge = ik.world.edges[foot.surface][tiptoe.edge]
+    ik.kin.update(home.q)
+    ends = ik.kin.point(edge.body, edge.corners)
+    corners = ik.kin.bearing_points(foot.surface, UP)
+    assert np.allclose(ends[:, 0], corners[:, 0].max(), atol=1e-6)
+    assert np.allclose(tiptoe.position, ends.mean(axis=0))
+
+
+def test_a_foot_rolls_onto_its_heel_where_the_others_are_behind(ik, demo_plan):
+    home = demo_plan.keyframes[0]
+    foot = home.stance[0]
+    heel = rolled(ik, home.q, foot, foot.position - 0.4 * AHEAD)
+    ik.kin.update(home.q)
+    assert heel.position[0] == pytest.approx(
+        ik.kin.bearing_points(foot.surface, UP)[:, 0].min()
+    )
+
+
+def test_a_round_surface_does_not_roll_onto_an_edge(ik, demo_plan):
+    last = demo_plan.keyframes[-1]
+    elbow = last.stance[0]
+    assert ik.world.surfaces[elbow.surface].rotation is None
+    assert rolled(ik, last.q, elbow, elbow.position + AHEAD) is elbow
+
+
+def test_no_corner_of_a_rolling_foot_enters_the_ground_and_toes_stay(
+    transitions, demo_kinematics
+):
+    lifted = []
+    for t in transitions:
+        for c in t.rolling:
+            if c.edge is None:
+                continue
+            demo_kinematics.update(t.shifted)
+            heights = demo_kinematics.bearing_points(c.surface, UP)[:, 2]
+            toes = demo_kinematics.bearing_points(c.surface, UP, c.edge)[:, 2]
+            assert heights.min() > -2e-3
+            assert np.abs(toes).max() < 1e-3
+            lifted.append(heights.max())
+    assert max(lifted) > 0.005  # the last foot needs it: its heel comes off
+
+
+# The ellipse (4.28).
+
+
+def test_the_ellipse_task_pulls_the_centre_of_mass_into_the_ellipse(ik, transitions):
+    t = transitions[-1]  # off the last foot: the polygon alone stops at its border
+
+    def excess(weight: float) -> float:
+        problem = balance_problem(
+            ik.world, held=t.held, closed=t.rolling, q_reference=t.before
+        )
+        problem = replace(
+            problem, ellipse_weight=weight, com_weight=0.0, balance_margin=0.0
+        )
+        solution = ik.solve_hard(problem, t.before)
+        assert solution.status is Status.SOLVED
+        ik.kin.update(solution.q)
+        return support_ellipse(polygon_of(ik.kin, t.held)).excess(ik.kin.com)[0]
+
+    without, weak, strong = (excess(w) for w in (0.0, 2.0, 20.0))
+    assert without > 1e-3
+    assert strong < weak < without
+    assert strong < 0.3 * without
+
+
+# Contacts that give way.
+
+
+def test_a_contact_out_of_reach_is_approached_as_near_as_it_goes(ik, demo_plan):
+    feet = demo_plan.keyframes[0]
+    wanted = Contact(
+        surface="LHand",
+        support="box",
+        position=np.array([0.8, 0.1, 0.275]),
+        quaternion=np.array([1.0, 0, 0, 0]),
+    )
+    near, solution = approach_contact(ik, feet.stance, wanted, demo_plan.keyframes[1].q)
+    assert solution.status is Status.SOLVED
+    ik.kin.update(solution.q)
+    assert np.allclose(ik.kin.contact_point("LHand", UP), near.position, atol=1e-3)
+    assert near.position[2] == pytest.approx(0.275, abs=1e-9)
+    assert near.position[0] > 0.45  # at arm's length, not given up
+    assert near.position[0] < 0.75
+
+
+def test_a_contact_within_reach_is_approached_exactly(ik, demo_plan):
+    before, after = demo_plan.keyframes[1:3]
+    wanted = next(c for c in after.stance if c.surface == "RHand")
+    near, solution = approach_contact(ik, before.stance, wanted, after.q)
+    assert solution.status is Status.SOLVED
+    assert np.linalg.norm(near.position - wanted.position) < 5e-3
