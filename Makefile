@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-all fast lint type bench docs build clean
+.PHONY: help demo test test-all fast lint type bench pictures docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -42,6 +42,12 @@ type: $(VENV)/.has-video $(VENV)/.has-dev ## pyright on src
 
 bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same jobs in other libraries
 	@for f in benchmarks/*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
+
+pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a climb
+	rm -rf build/climb
+	$(BIN)/clamber climb --out build/climb
+	cp build/climb/climb.png docs/climb.png
+	$(BIN)/python -c 'from clamber.viz import cost_shapes; cost_shapes("docs/cost-shapes.png")'
 
 docs: $(VENV)/.has-docs ## the documentation as a web site, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

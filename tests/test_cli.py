@@ -408,3 +408,177 @@ def test_render_names_its_files(
     assert cli.main(["render", "somewhere", "--json"]) == 0
     files = json.loads(capsys.readouterr().out)["files"]
     assert files == [str(tmp_path / "run" / "video.mp4")]
+
+
+# Mistakes of a user, through the whole command.
+
+
+RECORDING = """
+file: joints.npy
+rate: 120
+unit: {unit}
+names: [LHand, RHand]
+"""
+
+
+def spoiled_robot(folder: Path) -> Path:
+    """COMAN's files, the description naming a surface that the model has not."""
+    from clamber.model import ROBOTS
+
+    for p in (ROBOTS / "coman").iterdir():
+        (folder / p.name).write_bytes(p.read_bytes())
+    path = folder / "robot.yaml"
+    text = path.read_text().replace("[LHand, LElbow]", "[LHand, LTip]")
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("no.npy", None, "no.npy"),
+        ("film.mp4", "", "film.mp4"),
+        ("joints.npy", "no array", "joints.npy"),
+        ("recording.yaml", RECORDING.format(unit="inch"), "unit is 'inch'"),
+        ("recording.yaml", "- a\n- b\n", "recording.yaml"),
+        ("recording.yaml", RECORDING.format(unit="m"), "joints.npy"),
+    ],
+)
+def test_a_recording_that_cannot_be_used_is_one_sentence(
+    name: str,
+    content: str | None,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    path = tmp_path / name
+    if content is not None:
+        path.write_text(content)
+    for command in (["climb", "--demo", path], ["contacts", path]):
+        out = tmp_path / "out"
+        assert cli.main([*map(str, command), "--quiet", "--out", str(out)]) == 2
+        err = capsys.readouterr().err
+        assert said in err
+        assert err.count("\n") == 1
+        assert not out.exists()
+
+
+def one_stance(folder: Path) -> Path:
+    """A sequence that any scene with a box fits."""
+    import numpy as np
+
+    from clamber.contact import Contact, ContactSequence, Stance
+    from clamber.scene import Scene
+
+    def on(surface: str, support: str, x: float, z: float) -> Contact:
+        y = 0.07 if surface[0] == "L" else -0.07
+        position, quaternion = np.array([x, y, z]), np.array([1.0, 0, 0, 0])
+        return Contact(
+            surface=surface, support=support, position=position, quaternion=quaternion
+        )
+
+    feet = (on("LFoot", "ground", 0.0, 0.0), on("RFoot", "ground", 0.0, 0.0))
+    sequence = ContactSequence(
+        source="made up",
+        subject=None,
+        scene=Scene.from_height(0.3),
+        stances=(
+            Stance(contacts=feet),
+            Stance(contacts=(*feet, on("LHand", "box", 0.43, 0.3))),
+        ),
+        t=np.array([0.0, 1.0, 2.0]),
+    )
+    clamber.save_sequence(sequence, folder / "sequence.json")
+    return folder / "sequence.json"
+
+
+def test_a_box_out_of_reach_is_named_with_its_file(
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    scene_file.write_text(scene_file.read_text().replace("[0.705, 0.0]", "[5.0, 0.0]"))
+    command = ["plan", str(one_stance(tmp_path)), "--quiet", "--out", str(tmp_path)]
+    assert cli.main([*command, "--scene", str(scene_file)]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"clamber: {scene_file}: boxes.table is '4.5")
+    assert "the robot's reach" in err
+    assert cli.main([*command, "--height", "3.0"]) == 2
+    assert "--height: boxes.box is '3.0" in capsys.readouterr().err
+
+
+def test_a_robot_without_the_surface_it_names_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    robot = spoiled_robot(tmp_path)
+    assert cli.main(["climb", "--robot", str(robot), "--quiet"]) == 2
+    err = capsys.readouterr().err
+    for word in (str(robot), "limbs.left_arm.surfaces", "LTip", "geoms of coman.xml"):
+        assert word in err
+    assert err.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "taken").write_text("")
+    out = str(tmp_path / "taken")
+    sequence = str(one_stance(tmp_path))
+    assert cli.main(["plan", sequence, "--quiet", "--out", out]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"clamber: --out is '{out}'; expected a folder that can be")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("speed", ["0", "-0.3", "nan"])
+def test_a_speed_that_is_none_is_refused(
+    speed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    command = ["plan", str(one_stance(tmp_path)), "--quiet", "--out", str(tmp_path)]
+    assert cli.main([*command, "--speed", speed]) == 2
+    err = capsys.readouterr().err
+    assert "speed" in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["simulate", "render"])
+def test_a_run_that_is_none_is_one_sentence(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main([command, str(tmp_path / "nowhere"), "--quiet"]) == 2
+    err = capsys.readouterr().err
+    assert "nowhere" in err
+    assert "expected a run folder" in err
+    (tmp_path / "plan.json").write_text("{")
+    assert cli.main([command, str(tmp_path), "--quiet"]) == 2
+    assert "plan.json" in capsys.readouterr().err
+
+
+def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """One hand on a box that is no goal yet: planned and held, but not on top."""
+    run_folder = tmp_path / "run"
+    command = ["plan", str(one_stance(tmp_path)), "--height", "0.25", "--json"]
+    assert cli.main([*command, "--out", str(run_folder)]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["complete"] is True
+    assert [k["move"] for k in record["keyframes"]] == ["start", "air -> LHand on box"]
+    assert record["keyframes"][1]["seconds"] > 0
+    assert cli.main(["simulate", str(run_folder), "--json"]) == 1
+    record = json.loads(capsys.readouterr().out)
+    assert record["reached"] is False
+    on_top = record["criteria"]["share of the weight at the end on obstacles"]
+    assert 0.0 < on_top["value"] < 0.5
+    held = "share of the weight at the end on planned contacts"
+    assert record["criteria"][held]["ok"] is True
+    assert {p.name for p in run_folder.iterdir()} == {
+        "sequence.json",
+        "plan.json",
+        "trajectory.npz",
+        "scene.xml",
+        "timings.json",
+        "rollout.npz",
+        "verdict.json",
+    }
+    seconds = json.loads((run_folder / "timings.json").read_text())["seconds"]
+    assert seconds["simulate"] > 0
+    assert seconds["keyframes"] > 0

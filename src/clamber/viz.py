@@ -42,7 +42,7 @@ AZIMUTH, ELEVATION = 288.0, -17.0  # [deg] from the left, a little behind: the b
 # neither the feet on the ground nor the hands on its top
 MARGIN = 0.08  # share of the picture left free around what must be seen
 EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
-GROUND_SHOWN = 7.0  # [m] half width of the ground in pictures
+GROUND_SHOWN = 5.5  # [m] half width of the ground in pictures
 LOADED = 0.01  # [weights] a surface that bears more is loaded
 TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
 SAMPLES = 400  # of a plot over time
@@ -170,7 +170,9 @@ class Camera:
         model = copy.copy(world.model)  # looks are set here, the world's stay
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4 if smooth else 0
-        model.vis.quality.shadowsize = 4096 if smooth else 1024
+        model.vis.quality.shadowsize = 2048
+        if not smooth:
+            model.vis.quality.numslices, model.vis.quality.numstacks = 16, 8
         # A ground without end is shaded with speckles where the shadow map ends.
         model.vis.map.shadowclip = 4.0
         model.geom_size[world.support_geom[GROUND], :2] = GROUND_SHOWN
