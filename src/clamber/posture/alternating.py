@@ -39,7 +39,9 @@ class Alternation:
             ik.kin, task, references, options.stability_weight
         )
         self.lowest = np.inf
-        margins = [(s.polygon.min(axis=0), s.polygon.max(axis=0)) for s in self.supports]
+        margins = [
+            (s.polygon.min(axis=0), s.polygon.max(axis=0)) for s in self.supports
+        ]
         self.lower = np.array([lo + EDGE_INSET for lo, _ in margins]).ravel()
         self.upper = np.array([hi - EDGE_INSET for _, hi in margins]).ravel()
 

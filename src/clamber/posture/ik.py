@@ -428,8 +428,8 @@ class IK:
         """`solve` for postures far from `q`, with more than one way to get there.
 
         Distances make the problem non-convex: from `q`, a limb may be on the wrong side
-        of an edge. Where the straight way stalls, the solve is tried again from where it
-        stalled, and from the posture that would do if nothing could collide.
+        of an edge. Where the straight way stalls, the solve is tried again from where
+        it stalled, and from the posture that would do if nothing could collide.
         """
         first = self.solve(problem, q)
         if first.status is Status.SOLVED:
@@ -627,26 +627,33 @@ class IK:
                 problem.direction_weight,
             )
 
-    def _bearing(self, problem: PostureProblem) -> tuple[list[int], np.ndarray]:
-        """Body of each point that bears load (-1: it stays put), and (n, 3) points."""
-        bodies, points = [], []
+    def _bearing(
+        self, problem: PostureProblem
+    ) -> tuple[list[tuple[int, np.ndarray] | None], np.ndarray]:
+        """The points (n, 3) that bear load, and what moves each of them.
+
+        What moves a point is a body and, relative to the point, the place on it that
+        moves alike: a ball's contact stays under its centre. None where it stays put.
+        """
+        movers: list[tuple[int, np.ndarray] | None] = []
+        points = []
         for g in problem.goals:
             if not (g.hard and g.loaded):
                 continue
-            p = self.kin.bearing_points(
-                g.surface, self.world.supports[g.support].normal, g.edge
-            )
+            n = self.world.supports[g.support].normal
+            p = self.kin.bearing_points(g.surface, n, g.edge)
             s = self.world.surfaces[g.surface]
-            bodies += [s.body if g.free or not s.is_flat else -1] * len(p)
+            still = s.is_flat and not g.free
+            movers += [None if still else (s.body, s.radius * n)] * len(p)
             points.append(p)
-        return bodies, np.concatenate(points) if points else np.zeros((0, 3))
+        return movers, np.concatenate(points) if points else np.zeros((0, 3))
 
     def _polygon_motion(
         self,
         A: np.ndarray,
         polygon: np.ndarray,
         com: np.ndarray,
-        bodies: list[int],
+        movers: list[tuple[int, np.ndarray] | None],
         points: np.ndarray,
         rows: np.ndarray,
     ) -> None:
@@ -655,32 +662,23 @@ class IK:
         The distance of c from the line through p and q changes by
         n'((1 - t) dp + t dq - dc), t the share of the edge at which c lies abreast.
         """
-        if all(b < 0 for b in bodies):
-            return
-        kin = self.kin
         gaps = np.abs(polygon[:, None] - points[None, :, :2]).sum(axis=2)
-        owner = np.argmin(gaps, axis=1)
-        jacobians: dict[int, np.ndarray] = {}
-        for i in {int(o) for o in owner if bodies[int(o)] >= 0}:
-            # A ball's contact stays under its centre, a corner is a point of its link.
-            s = next(x for x in self.world.surfaces.values() if x.body == bodies[i])
-            centre = points[i] + [0.0, 0.0, s.radius] if not s.is_flat else points[i]
-            jacobians[i] = kin.point_jacobian(bodies[i], centre)[:2].copy()
-        for e in range(len(A)):
-            p, q = polygon[e], polygon[(e + 1) % len(polygon)]
-            along = q - p
-            t = float((com - p) @ along) / float(along @ along)
-            for share, vertex in (
-                (1.0 - t, owner[e]),
-                (t, owner[(e + 1) % len(polygon)]),
-            ):
-                J = jacobians.get(int(vertex))
-                if J is not None:
-                    rows[e] -= share * (A[e] @ J)
+        owner = gaps.argmin(axis=1)
+        moves = np.zeros((len(polygon), 2, rows.shape[1]))
+        for i, o in enumerate(owner.tolist()):
+            mover = movers[o]
+            if mover is not None:
+                body, offset = mover
+                moves[i] = self.kin.point_jacobian(body, points[o] + offset)[:2]
+        along = np.roll(polygon, -1, axis=0) - polygon
+        t = ((com - polygon) * along).sum(axis=1) / (along * along).sum(axis=1)
+        t = t[:, None, None]
+        edge = (1.0 - t) * moves + t * np.roll(moves, -1, axis=0)
+        rows -= (A[:, :, None] * edge).sum(axis=1)
 
     def _balance_rows(self, problem: PostureProblem) -> None:
-        bodies, points = self._bearing(problem)
-        if not bodies:
+        movers, points = self._bearing(problem)
+        if not movers:
             return
         polygon = support_polygon(points[:, :2])
         com = self.kin.com[:2].copy()
@@ -690,8 +688,8 @@ class IK:
         self._violation += _size(np.minimum(room, 0.0))
         k = self._ineq.take(len(b))
         self._ineq.J[k] = A @ J
-        if len(polygon) == len(b):
-            self._polygon_motion(A, polygon, com, bodies, points, self._ineq.J[k])
+        if len(polygon) == len(b) and any(movers):
+            self._polygon_motion(A, polygon, com, movers, points, self._ineq.J[k])
         self._ineq.hi[k] = room
         self._ineq.lo[k] = -1e30
         if problem.com_weight > 0:
@@ -717,7 +715,10 @@ class IK:
 
     def _distance_rows(self, clearance: np.ndarray, reach: float) -> None:
         kin = self.kin
-        near = kin.proximity(reach, np.isfinite(clearance))
+        counts = np.isfinite(clearance)
+        if not counts.any():
+            return
+        near = kin.proximity(reach, counts)
         if len(near.pairs) == 0:
             return
         k = self._ineq.take(len(near.pairs))
