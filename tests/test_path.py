@@ -1,0 +1,298 @@
+"""Paths: arcs over the edge, pushed clear of everything, contacts in place."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from clamber.errors import Status
+from clamber.path import (
+    SAFE_HEIGHT,
+    TOP_RISE,
+    arc,
+    check_phases,
+    interpolate,
+    overlap,
+    plan_path,
+    watched_pairs,
+)
+from clamber.pipeline import plan
+from clamber.posture.ik import IK
+from clamber.posture.keyframe import CLEARANCE, bearing_frames, contact_drift
+from clamber.scene import Box, Scene
+from clamber.statics import com_margin, support_polygon
+
+
+@pytest.fixture(scope="module")
+def ik(demo_plan):
+    return IK(demo_plan.world)
+
+
+def halves(kin, nodes):
+    """All postures of a phase and those half-way between."""
+    yield nodes[0]
+    for a, b in itertools.pairwise(nodes):
+        yield interpolate(kin, a, b, 0.5)
+        yield b
+
+
+def limb_to_box(world, q, limb: str, box: str = "box") -> float:
+    """Least distance of any link of a limb to a box, by MuJoCo alone [m]."""
+    model, data = world.model, mujoco.MjData(world.model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    root = world.landmark(world.robot.limbs[limb].root)[0]
+
+    def below(body: int) -> bool:
+        while body and body != root:
+            body = int(model.body_parentid[body])
+        return body == root
+
+    target, fromto = model.geom(box).id, np.zeros(6)
+    return min(
+        mujoco.mj_geomDistance(model, data, g, target, 1.0, fromto)
+        for g in range(model.ngeom)
+        if model.geom_contype[g] | model.geom_conaffinity[g]
+        and below(int(model.geom_bodyid[g]))
+    )
+
+
+# Arcs (4.29).
+
+
+def dense(p1, p2, top=0.0, on_top=False) -> np.ndarray:
+    return arc(np.array(p1), np.array(p2), top, on_top, 4001)
+
+
+def test_an_arc_begins_and_ends_where_it_should(rng):
+    for p1, p2 in rng.uniform(0, 1, (50, 2, 3)):
+        points = arc(p1, p2, rng.uniform(0, 1), bool(rng.integers(2)), 12)
+        assert np.allclose(points[0], p1)
+        assert np.allclose(points[-1], p2)
+
+
+def test_the_apex_is_half_the_way_above_the_middle():
+    p1, p2 = [0.0, 0.0, 0.1], [0.6, 0.0, 0.3]
+    length = np.hypot(0.6, 0.2)
+    assert dense(p1, p2)[:, 2].max() == pytest.approx(0.2 + length / 2, abs=1e-5)
+
+
+def test_the_apex_clears_the_obstacle_where_that_is_higher():
+    top = dense([0.0, 0.0, 0.0], [0.1, 0.0, 0.4], top=0.4)[:, 2].max()
+    assert top == pytest.approx(0.4 + SAFE_HEIGHT, abs=1e-5)
+
+
+def test_the_apex_is_capped_where_both_ends_are_on_top():
+    p1, p2 = [0.3, 0.1, 0.4], [0.9, 0.1, 0.4]
+    free, capped = (dense(p1, p2, 0.4, on)[:, 2].max() for on in (False, True))
+    assert free == pytest.approx(0.7, abs=1e-5)
+    assert capped == pytest.approx(0.4 + TOP_RISE + SAFE_HEIGHT, abs=1e-5)
+
+
+def test_the_cap_does_not_raise_a_short_arc():
+    short = dense([0.3, 0.1, 0.4], [0.34, 0.1, 0.4], 0.4, True)[:, 2].max()
+    assert short == pytest.approx(0.4 + SAFE_HEIGHT, abs=1e-5)
+
+
+def test_every_arc_reaches_the_apex_of_the_formula(rng):
+    for p1, p2 in rng.uniform(0, 1, (100, 2, 3)):
+        top, on_top = rng.uniform(0, 1), bool(rng.integers(2))
+        apex = max((p1 + p2)[2] / 2 + np.linalg.norm(p1 - p2) / 2, top + SAFE_HEIGHT)
+        if on_top:
+            apex = min(apex, max(p1[2], p2[2]) + TOP_RISE + SAFE_HEIGHT)
+        assert dense(p1, p2, top, on_top)[:, 2].max() == pytest.approx(apex, abs=1e-4)
+
+
+def test_an_arc_rises_to_its_apex_and_falls_from_there(rng):
+    for p1, p2 in rng.uniform(0, 1, (50, 2, 3)):
+        z = dense(p1, p2, 0.5)[:, 2]
+        k = int(np.argmax(z))
+        assert np.all(np.diff(z[: k + 1]) >= 0)
+        assert np.all(np.diff(z[k:]) <= 0)
+
+
+def test_the_horizontal_part_is_straight_and_never_turns_back(rng):
+    for p1, p2 in rng.uniform(-1, 1, (50, 2, 3)):
+        points = arc(p1, p2, 0.5, False, 9)
+        steps = np.diff(points[:, :2], axis=0)
+        assert np.allclose(steps, (p2 - p1)[:2] / 8)
+
+
+@pytest.mark.parametrize(("asked", "given"), [(2, 5), (5, 5), (12, 12)])
+def test_an_arc_has_at_least_five_control_points(asked, given):
+    assert len(arc(np.zeros(3), np.ones(3), 0.0, False, asked)) == given
+
+
+def test_straight_up_needs_no_bulge():
+    points = dense([0.2, 0.1, 0.0], [0.2, 0.1, 0.5])
+    assert points[:, 2].max() == pytest.approx(0.5)
+
+
+# The paths of the demonstration.
+
+
+def test_every_path_of_the_demonstration_is_solved(demo_plan):
+    assert [p.status for p in demo_plan.paths] == [Status.SOLVED] * 6
+
+
+def test_end_points_are_the_postures_of_the_transition(demo_plan):
+    for path in demo_plan.paths:
+        t, (shift, swing, settle) = path.transition, path.phases
+        assert [p.kind for p in path.phases] == ["shift", "swing", "settle"]
+        for a, b in (
+            (shift.q[0], t.before),
+            (shift.q[-1], t.shifted),
+            (swing.q[0], t.shifted),
+            (swing.q[-1], t.touching),
+            (settle.q[0], t.touching),
+            (settle.q[-1], t.after),
+        ):
+            assert np.array_equal(a, b)
+
+
+def test_each_path_begins_where_the_last_one_ended(demo_plan):
+    for a, b in itertools.pairwise(demo_plan.paths):
+        assert np.array_equal(a.phases[-1].q[-1], b.phases[0].q[0])
+
+
+def test_contacts_stay_in_place_at_and_between_all_postures(demo_plan, demo_kinematics):
+    for path in demo_plan.paths:
+        for phase in path.phases:
+            for q in halves(demo_kinematics, phase.q):
+                demo_kinematics.update(q)
+                drift = [contact_drift(demo_kinematics, c) for c in phase.contacts]
+                assert max(drift) < 5e-3
+
+
+def test_contacts_neither_leave_nor_enter_their_supports(demo_plan, demo_kinematics):
+    for path in demo_plan.paths:
+        for phase in path.phases:
+            for q in halves(demo_kinematics, phase.q):
+                demo_kinematics.update(q)
+                for c in phase.contacts:
+                    support = demo_kinematics.world.supports[c.support]
+                    p = demo_kinematics.contact_point(c.surface, support.normal, c.edge)
+                    assert abs(support.height(p)) < 5e-3
+
+
+def test_the_centre_of_mass_stays_over_the_contacts_that_bear_load(
+    demo_plan, demo_kinematics
+):
+    for path in demo_plan.paths:
+        for phase in path.phases:
+            load = {c.surface: c for c in (*phase.load_before, *phase.load_after)}
+            for q in phase.q:
+                demo_kinematics.update(q)
+                points = bearing_frames(demo_kinematics, tuple(load.values()))[1]
+                polygon = support_polygon(points[:, :2])
+                assert com_margin(demo_kinematics.com, polygon) > 5e-3
+
+
+def test_the_moving_surface_follows_its_arc(demo_plan, demo_kinematics):
+    for path in demo_plan.paths:
+        made, swing = path.transition.move.makes, path.phases[1]
+        normal = demo_kinematics.world.supports[made.support].normal
+        way = []
+        for q in swing.q:
+            demo_kinematics.update(q)
+            way.append(demo_kinematics.contact_point(made.surface, normal))
+        off = [np.linalg.norm(swing.arc - p, axis=1).min() for p in way]
+        assert np.median(off) < 0.02
+        assert np.array(way)[:, 2].max() > 0.7 * SAFE_HEIGHT + made.position[2]
+
+
+def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinematics):
+    """All pairs but those of closed contacts, by MuJoCo's distances."""
+    world = demo_kinematics.world
+    for path in demo_plan.paths:
+        t = path.transition
+        for phase in path.phases:
+            # At its very ends the moving surface touches what it leaves and meets.
+            closed = phase.contacts
+            ends = (*closed, *t.leaving, t.move.makes)
+            inner, outer = (watched_pairs(world, c, ()) for c in (closed, ends))
+            for i, q in enumerate(phase.q):
+                demo_kinematics.update(q)
+                is_end = i in (0, len(phase.q) - 1)
+                near = demo_kinematics.proximity(0.0, outer if is_end else inner)
+                assert near.distance.min(initial=0.0) > -4e-3
+
+
+# Collisions and how they are found.
+
+
+def test_a_swing_straight_through_the_box_is_refused(demo_plan, ik):
+    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.move.breaks)
+    swing = path.phases[1]
+    # The right shank, which has no business on the box, goes through its edge.
+    sunk = swing.q.copy()
+    sunk[3:-3, 0] += 0.25
+    sunk_phase = replace(swing, q=sunk, contacts=())
+    status, note = check_phases(ik, (sunk_phase,), path.transition)
+    assert status is Status.COLLIDING
+    assert "box" in note
+    assert "(swing)" in note
+
+
+def test_an_open_contact_is_refused(demo_plan, ik):
+    path = demo_plan.paths[2]
+    lifted = path.phases[0].q.copy()
+    lifted[:, 2] += 0.03
+    broken = (replace(path.phases[0], q=lifted), *path.phases[1:])
+    status, note = check_phases(ik, broken, path.transition)
+    assert status is Status.UNREACHABLE
+    assert note == "a contact opens by 30 mm (shift)"
+
+
+def test_overlap_is_the_depth_that_mujoco_measures(demo_plan, ik):
+    world, q = demo_plan.world, demo_plan.keyframes[0].q.copy()
+    q[0] += 0.25  # legs and all into the box
+    depth, pair = overlap(ik, q, np.ones(len(world.pairs), bool))
+    data, fromto = mujoco.MjData(world.model), np.zeros(6)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(world.model, data)
+    deepest = min(
+        mujoco.mj_geomDistance(world.model, data, int(a), int(b), 0.1, fromto)
+        for a, b in world.pairs
+    )
+    assert depth == pytest.approx(-deepest)
+    a, b = world.pairs[pair]
+    assert "box" in {world.model.geom(int(a)).name, world.model.geom(int(b)).name}
+
+
+def test_standing_upright_nothing_overlaps(demo_plan, ik):
+    key = demo_plan.keyframes[0]
+    watched = watched_pairs(demo_plan.world, key.stance, ())
+    assert overlap(ik, key.q, watched) == (0.0, -1)
+
+
+def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
+    demo_sequence, coman
+):
+    """Figure 4.16: a high box right before the shins, both knees on their way up."""
+    height, face = 0.44, 0.15
+    box = Box(
+        name="box",
+        size=np.array([1.0, 1.2, height]),
+        position=np.array([face + 0.5, 0.0, height / 2]),
+        rotation=np.eye(3),
+    )
+    result = plan(demo_sequence, coman, Scene(boxes=(box,), start=np.zeros(3)))
+    knees = [p for p in result.paths if "leg" in p.transition.move.limb]
+    assert len(knees) == 2
+    ik = IK(result.world)
+    for path in knees:
+        limb = path.transition.move.limb
+        plain = plan_path(ik, path.transition, adapt=False).phases[1].q
+        entered = min(limb_to_box(result.world, q, limb) for q in plain[1:-1])
+        assert entered < -5e-3
+        # Near its ends the surface is still, or already, close to its support.
+        adapted = path.phases[1].q
+        inner = adapted[len(adapted) // 5 : -(len(adapted) // 5)]
+        assert min(limb_to_box(result.world, q, limb) for q in adapted) > -1e-3
+        kept = min(limb_to_box(result.world, q, limb) for q in inner)
+        assert kept > CLEARANCE - 1.5e-3
