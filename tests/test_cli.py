@@ -344,7 +344,7 @@ def test_a_plan_without_any_move_is_not_simulated(
     stages.plan.trajectory, stages.plan.complete = None, False
     assert cli.main(["climb"]) == 1
     assert "simulate" not in stages.calls
-    assert "cannot do it, out of reach [0.4 m]" in capsys.readouterr().out
+    assert "cannot do it: out of reach [0.4 m]" in capsys.readouterr().out
     assert cli.main(["simulate", "somewhere"]) == 1
     assert "simulate" not in stages.calls
 
@@ -359,7 +359,7 @@ def test_an_incomplete_plan_gives_the_reason_of_the_first_move_missed(
     for command in (["climb"], ["plan", "sequence.json"]):
         assert cli.main(command) == 1
         last = capsys.readouterr().out.splitlines()[-1]
-        said = "the robot cannot do it, LFoot -> LKnee on table: too high: the files"
+        said = "the robot cannot do it: LFoot -> LKnee on table: too high; the files"
         assert last.startswith(said)
 
 

@@ -307,7 +307,7 @@ class PlanCommand:
             with self.world.blamed():
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
         record = {"out": str(folder), **_plan_record(plan, clock)}
-        note = f"{_outcome(plan)}: the files are in {folder}"
+        note = f"{_outcome(plan)}; the files are in {folder}"
         self.output.show(record, _keyframes(record), *_skipped(plan), note=note)
         return REACHED if plan.complete else MISSED
 
@@ -431,7 +431,9 @@ def _plan(
     """Plan and save."""
     options = clamber.PlanOptions(**asdict(flags))
     result = clamber.plan(sequence, robot, scene, options=options, progress=report)
+    report("save", 0.0, "")
     clamber.save_plan(result, folder)
+    report("save", 1.0, "")
     return result
 
 
@@ -452,7 +454,9 @@ def _save_timings(folder: Path, clock: Clock) -> None:
     """Add the seconds of the stages that were watched."""
     from clamber.io import save_timings
 
-    save_timings(folder, clock.stages())
+    finer = ("plan", "trajectory")  # of which the plan itself knows the parts
+    stages = clock.stages().items()
+    save_timings(folder, {k: v for k, v in stages if k not in finer})
 
 
 def _table(*columns: str) -> Table:
@@ -564,7 +568,7 @@ def _outcome(plan: clamber.Plan) -> str:
         return "planned to the last stance"
     missed = [s.reason for s in plan.skipped if " -> " in s.reason]
     why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
-    return f"the robot cannot do it, {why}"
+    return f"the robot cannot do it: {why}"
 
 
 def _skipped(plan: clamber.Plan) -> list[Table]:
@@ -610,7 +614,7 @@ def _conclude(
     tables = [_keyframes(planned)] if clock is not None else []
     tables += _skipped(plan)
     tables += [table] if criteria else []
-    output.show(record, *tables, note=f"{note}: the files are in {folder}")
+    output.show(record, *tables, note=f"{note}; the files are in {folder}")
     return REACHED if reached else MISSED
 
 
