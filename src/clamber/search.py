@@ -77,7 +77,7 @@ def plan_steps(
     """
     keyframes = [standing(ik, options)]
     paths: list[Path] = []
-    missed: list[Skipped] = []
+    missed: dict[int, Skipped] = {}  # by step
     steps = list(steps)
     done: list[int] = []  # the step that each path makes
     repairs = k = 0
@@ -96,17 +96,19 @@ def plan_steps(
             better = repair(ik, keyframes, paths, step.move)
             lap("repairs")
         if better is None:
-            missed.append(Skipped(stance=step.stance, reason=result))
+            missed[k] = Skipped(stance=step.stance, reason=result)
             k += 1
             continue
         repairs += 1
         j, contact = better
         k = done[j]
         del keyframes[j + 1 :], paths[j:], done[j:]
-        missed = [m for m in missed if m.stance <= steps[k].stance]
+        missed = {i: m for i, m in missed.items() if i < k}
         firm = replace(steps[k].move, makes=contact, firm=True)
         steps[k] = replace(steps[k], move=firm)
-    return Found(keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed))
+    return Found(
+        keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed.values())
+    )
 
 
 def standing(ik: IK, options: KeyframeOptions) -> Keyframe:

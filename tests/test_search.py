@@ -1,0 +1,255 @@
+"""Steps in order: what fails is skipped with its reason or mended further back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clamber import search
+from clamber.contact import Contact, Stance
+from clamber.errors import Status
+from clamber.model import build_world
+from clamber.moves import Move, Step, split_moves
+from clamber.posture.ik import IK
+from clamber.posture.keyframe import KeyframeOptions
+from clamber.scaling import retarget
+from clamber.scene import Box, Scene
+from clamber.se3 import matrix_from_rpy
+from clamber.search import MOVED, plan_step, plan_steps, repair, standing
+
+OPTIONS = KeyframeOptions()
+HEIGHT = 0.275
+
+
+def quiet(*_: object) -> None:
+    """No timing, no progress."""
+
+
+def find(ik, steps, method="direct"):
+    return plan_steps(ik, steps, method, OPTIONS, lap=quiet, report=quiet)
+
+
+def surfaces(keyframe) -> set[str]:
+    return {c.surface for c in keyframe.stance}
+
+
+@pytest.fixture(scope="module")
+def ik(coman):
+    """The usual box, and another one far behind it."""
+    far = Box(
+        name="far",
+        size=np.array([1.0, 1.2, 0.4]),
+        position=np.array([4.0, 0.0, 0.2]),
+        rotation=np.eye(3),
+    )
+    scene = Scene.from_height(HEIGHT)
+    return IK(build_world(coman, replace(scene, boxes=(*scene.boxes, far))))
+
+
+@pytest.fixture(scope="module")
+def steps(ik, demo_sequence):
+    """Both hands, both elbows, both knees."""
+    steps, _ = split_moves(retarget(demo_sequence, ik.world), ik.world)
+    assert [s.move.makes.surface for s in steps] == [
+        "LHand",
+        "RHand",
+        "LElbow",
+        "RElbow",
+        "LKnee",
+        "RKnee",
+    ]
+    return steps
+
+
+def moved(step: Step, *, support: str | None = None, position, firm=False) -> Step:
+    """The same step with its contact elsewhere."""
+    makes = step.move.makes
+    makes = replace(makes, support=support or makes.support, position=position)
+    return replace(step, move=replace(step.move, makes=makes, firm=firm))
+
+
+# Standing.
+
+
+def test_the_robot_starts_on_both_feet_at_rest_over_them(ik):
+    key = standing(ik, OPTIONS)
+    assert surfaces(key) == {"LFoot", "RFoot"}
+    assert key.status is Status.SOLVED
+    assert np.array_equal(key.q, ik.world.home)
+    assert all(c.position[2] == 0.0 for c in key.stance)
+    assert np.mean([c.position for c in key.stance], axis=0)[1] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
+def test_feet_stand_where_the_scene_says_and_turned_as_it_says(coman, yaw):
+    start = np.array([0.4, -0.2, yaw])
+    key = standing(IK(build_world(coman, Scene(start=start))), OPTIONS)
+    across = np.subtract(*(c.position for c in key.stance))
+    assert np.allclose(
+        matrix_from_rpy([0, 0, -yaw]) @ across,
+        [0, across @ across, 0] / np.linalg.norm(across),
+        atol=1e-6,
+    )
+    assert key.status is Status.SOLVED
+
+
+# Steps that cannot be.
+
+
+def test_a_step_out_of_reach_is_skipped_with_its_reason_and_the_rest_goes_on(ik, steps):
+    far = moved(steps[1], support="far", position=np.array([4.0, 0.0, 0.4]))
+    found = find(ik, [steps[0], far, steps[1]])
+    assert [m.stance for m in found.missed] == [far.stance]
+    assert found.missed[0].reason.startswith("air -> RHand on far: ")
+    assert Status.UNREACHABLE.value in found.missed[0].reason
+    assert len(found.keyframes) == len(found.paths) + 1 == 3
+    assert surfaces(found.keyframes[-1]) == {"LFoot", "RFoot", "LHand", "RHand"}
+    assert {c.support for c in found.keyframes[-1].stance} == {"ground", "box"}
+
+
+def test_a_move_that_leaves_nothing_to_stand_on_is_refused(ik, steps):
+    both = Move(limb="left_leg", breaks=("LFoot", "RFoot"), makes=None)
+    step = Step(stance=1, target=steps[0].target, move=both)
+    reason = plan_step(ik, standing(ik, OPTIONS), step, "direct", OPTIONS, quiet)
+    assert reason == "LFoot, RFoot -> air: nothing else bears load"
+
+
+def test_nothing_to_do_finds_the_start_alone(ik):
+    found = find(ik, [])
+    assert len(found.keyframes) == 1
+    assert found.paths == found.missed == ()
+
+
+def test_a_firm_contact_is_made_where_it_is_wanted(ik, steps):
+    wanted = np.array([0.42, 0.12, HEIGHT])
+    found = find(ik, [moved(steps[0], position=wanted, firm=True)])
+    hand = next(c for c in found.keyframes[-1].stance if c.surface == "LHand")
+    assert np.linalg.norm(hand.position - wanted) < 5e-3
+
+
+def test_a_contact_that_is_not_firm_moves_towards_its_shoulder(ik, steps):
+    wanted = np.array([0.42, 0.02, HEIGHT])
+    firm, free = (
+        find(ik, [moved(steps[0], position=wanted, firm=f)]).keyframes[-1]
+        for f in (True, False)
+    )
+    assert free.cost_after < firm.cost_after
+    d_firm, d_free = (
+        next(c for c in k.contacts if c.contact.surface == "LHand").projected_distance
+        for k in (firm, free)
+    )
+    assert d_free < d_firm
+
+
+# Mending what lies further back.
+
+
+def test_a_badly_placed_knee_is_put_elsewhere_for_the_other_ones_sake(
+    ik, steps, monkeypatch
+):
+    bad = np.array([0.4, -0.1, HEIGHT])  # the left knee where the right one should go
+    tangled = [*steps[:4], moved(steps[4], position=bad, firm=True), steps[5]]
+    monkeypatch.setattr(search, "MAX_REPAIRS", 0)
+    stuck = find(ik, tangled)
+    assert [m.reason.split(":")[0] for m in stuck.missed] == ["RFoot -> RKnee on box"]
+    assert "RFoot" in surfaces(stuck.keyframes[-1])
+
+    monkeypatch.undo()
+    mended = find(ik, tangled)
+    assert mended.missed == ()
+    assert surfaces(mended.keyframes[-1]) >= {"LElbow", "RElbow", "LKnee", "RKnee"}
+    left, before = (
+        next(c.position for c in found.keyframes[5].stance if c.surface == "LKnee")
+        for found in (mended, stuck)
+    )
+    assert np.linalg.norm(left - before) > MOVED
+    assert all(k.status is Status.SOLVED for k in mended.keyframes)
+
+
+def test_no_repair_is_proposed_where_nothing_stands_on_a_contact_that_was_made(
+    ik, steps
+):
+    start = standing(ik, OPTIONS)
+    assert repair(ik, [start], [], steps[0].move) is None
+
+
+class FakePlanner:
+    """Stands in for `plan_step` and `repair`: names instead of postures."""
+
+    def __init__(self, monkeypatch, fails, repairs_to):
+        self.fails, self.repairs_to, self.tried = fails, repairs_to, []
+        monkeypatch.setattr(search, "plan_step", self.plan_step)
+        monkeypatch.setattr(search, "repair", self.repair)
+
+    def plan_step(self, ik, before, step, method, options, lap):
+        name = step.move.limb + ("!" if step.move.firm else "")
+        self.tried.append(name)
+        if self.fails(name, self.tried):
+            return f"{name} fails"
+        return name, f"path of {name}"
+
+    def repair(self, ik, keyframes, paths, move):
+        return self.repairs_to(move.limb, paths)
+
+
+def fake_steps(*names: tuple[str, int]) -> list[Step]:
+    target = Stance(contacts=())
+    contact = Contact(
+        surface="LHand", support="box", position=np.zeros(3), quaternion=np.eye(4)[0]
+    )
+    return [
+        Step(stance=i, target=target, move=Move(limb=n, breaks=(), makes=contact))
+        for n, i in names
+    ]
+
+
+def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
+    contact = fake_steps(("a", 1))[0].move.makes
+    fake = FakePlanner(
+        monkeypatch,
+        lambda name, tried: name == "c" and "a!" not in tried,
+        lambda limb, paths: (0, contact),
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
+    assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
+    assert found.keyframes[1:] == ("a!", "b", "c", "d")
+    assert found.paths == tuple(f"path of {n}" for n in ("a!", "b", "c", "d"))
+    assert found.missed == ()
+
+
+def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
+    contact = fake_steps(("a", 1))[0].move.makes
+    fake = FakePlanner(
+        monkeypatch, lambda name, tried: name == "b", lambda limb, paths: (0, contact)
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
+    assert fake.tried.count("b") == search.MAX_REPAIRS + 1
+    assert [m.reason for m in found.missed] == ["b fails"]
+    assert found.keyframes[1:] == ("a!", "c")
+
+
+def test_a_skipped_step_between_does_not_confuse_which_step_is_mended(ik, monkeypatch):
+    contact = fake_steps(("a", 1))[0].move.makes
+    fake = FakePlanner(
+        monkeypatch,
+        lambda name, tried: name == "a" or (name == "c" and "b!" not in tried),
+        lambda limb, paths: None if limb == "a" else (0, contact),
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
+    assert fake.tried == ["a", "b", "c", "b!", "c"]
+    assert [m.reason for m in found.missed] == ["a fails"]
+    assert found.keyframes[1:] == ("b!", "c")
+
+
+def test_a_step_skipped_before_and_after_a_repair_is_reported_once(ik, monkeypatch):
+    """Both steps belong to one stance: the second one is tried, and missed, again."""
+    contact = fake_steps(("a", 1))[0].move.makes
+    FakePlanner(
+        monkeypatch,
+        lambda name, tried: name == "b" or (name == "c" and "a!" not in tried),
+        lambda limb, paths: None if limb == "b" else (0, contact),
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 1), ("c", 2)))
+    assert [m.reason for m in found.missed] == ["b fails"]
