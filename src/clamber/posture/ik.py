@@ -476,7 +476,9 @@ class IK:
                     turn = turn - axis * (turn @ axis)
                 error = max(error, float(np.linalg.norm(turn)))
             contact = max(contact, error)
-        near = kin.proximity(0.02, np.isfinite(problem.clearance))
+        finite = np.isfinite(problem.clearance)
+        reach = float(problem.clearance.max(initial=0.02, where=finite))
+        near = kin.proximity(reach, finite)
         short = problem.clearance[near.pairs] - near.distance
         worst = int(np.argmax(short)) if len(short) else -1
         _, points = self._bearing(problem)
@@ -609,23 +611,32 @@ class IK:
         limbs = self.world.robot.limbs
         for name, u in problem.directions.items():
             if name == "trunk":
-                hips = [kin.landmark(limbs[n].root) for n in ("left_leg", "right_leg")]
-                tops = [kin.landmark(limbs[n].root) for n in ("left_arm", "right_arm")]
-                a = 0.5 * (hips[0][1] + hips[1][1])
-                b = 0.5 * (tops[0][1] + tops[1][1])
-                body_a, body_b = hips[0][0], tops[0][0]
+                a = self._middle("left_leg", "right_leg", self._jac2)
+                b = self._middle("left_arm", "right_arm", self._jac)
             else:
                 limb, first, second = _SEGMENTS[name]
-                body_a, a = kin.landmark(getattr(limbs[limb], first))
-                body_b, b = kin.landmark(getattr(limbs[limb], second))
+                body, a = kin.landmark(getattr(limbs[limb], first))
+                kin.point_jacobian(body, a, self._jac2)
+                body, b = kin.landmark(getattr(limbs[limb], second))
+                kin.point_jacobian(body, b, self._jac)
             length = float(np.linalg.norm(b - a))
-            kin.point_jacobian(body_b, b, self._jac)
-            kin.point_jacobian(body_a, a, self._jac2)
             self._target(
                 (self._jac - self._jac2) / length,
                 (b - a) / length - u,
                 problem.direction_weight,
             )
+
+    def _middle(self, left: str, right: str, jac: np.ndarray) -> np.ndarray:
+        """(3,) midway between two limbs' roots; `jac` (3, nv) receives its Jacobian.
+
+        Each root moves with its own body: where one arm turns, the middle stays.
+        """
+        a, p = self.kin.landmark(self.world.robot.limbs[left].root)
+        b, q = self.kin.landmark(self.world.robot.limbs[right].root)
+        self.kin.point_jacobian(a, p, jac)
+        jac += self.kin.point_jacobian(b, q)
+        jac *= 0.5
+        return 0.5 * (p + q)
 
     def _bearing(
         self, problem: PostureProblem

@@ -1,0 +1,924 @@
+"""Every row of the QP against finite differences; what is solved against MuJoCo."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import qpsolvers
+from scipy.optimize import nnls
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from clamber.errors import Status
+from clamber.model import Kinematics, World, build_world, load_robot
+from clamber.posture.ik import (
+    DAMPING,
+    EDGE_INSET,
+    EQUALITY,
+    IK,
+    SOFT,
+    STEP_ROTATION,
+    STEP_TRANSLATION,
+    ContactGoal,
+    PostureProblem,
+    base_clearance,
+    contact_clearance,
+)
+from clamber.scene import Box, Scene
+from clamber.se3 import (
+    frame_from_normal,
+    matrix_from_rpy,
+    quat_from_matrix,
+    rotation_vector,
+)
+
+UP = np.array([0.0, 0.0, 1.0])
+BALLS = ("LHand", "RElbow", "LKnee")
+SUPPORTS = ("ground", "yawed", "tilted")
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    boxes = tuple(
+        Box(
+            name=name,
+            size=np.array([0.8, 1.0, 0.3]),
+            position=np.array([x, 0.1, 0.1]),
+            rotation=matrix_from_rpy(rpy),
+        )
+        for name, x, rpy in (
+            ("yawed", 0.75, (0, 0, 0.5)),
+            ("tilted", -1.0, (0.2, -0.3, 1)),
+        )
+    )
+    return build_world(load_robot("coman"), Scene(boxes=boxes, start=np.zeros(3)))
+
+
+@pytest.fixture(scope="module")
+def ik(world) -> IK:
+    return IK(world)
+
+
+@pytest.fixture(scope="module")
+def plain() -> IK:
+    """The robot before the plain box of 0.275 m."""
+    return IK(build_world(load_robot("coman"), Scene.from_height(0.275)))
+
+
+def bent(world: World, seed: int) -> np.ndarray:
+    """(nq,) around home, leaning and with all joints moved."""
+    rng = np.random.default_rng(seed)
+    q = world.home.copy()
+    q[:3] += rng.uniform(-0.05, 0.05, 3)
+    q[3:7] = quat_from_matrix(matrix_from_rpy(rng.uniform(-0.4, 0.4, 3)))
+    q[world.qadr] += rng.uniform(-0.3, 0.3, len(world.qadr))
+    dof = world.dadr
+    q[world.qadr] = np.clip(q[world.qadr], world.q_min[dof], world.q_max[dof])
+    return q
+
+
+def goal_at(ik: IK, q: np.ndarray, surface: str, support: str, **kind) -> ContactGoal:
+    """A goal that is met where the surface is at `q`."""
+    kin, w = ik.kin, ik.world
+    kin.update(q)
+    s = w.surfaces[surface]
+    n = w.supports[support].normal
+    R = kin.rotation(s.body) @ (s.rotation if s.rotation is not None else np.eye(3))
+    p = kin.contact_point(surface, n, kind.get("edge"))
+    start = {"position": p, "rotation": R}
+    return ContactGoal(surface=surface, support=support, **(start | kind))
+
+
+def problem_of(world: World, *goals: ContactGoal, **changes) -> PostureProblem:
+    """Only these goals: nothing else pulls, and nothing can collide."""
+    nothing = {
+        "clearance": np.full(len(world.pairs), -np.inf),
+        "q_reference": world.home,
+        "balance": False,
+        "posture_weight": 0.0,
+        "com_weight": 0.0,
+        "base_weight": 0.0,
+    }
+    return PostureProblem(goals=goals, **(nothing | changes))
+
+
+def hard_rows(qp, nv: int) -> tuple[np.ndarray, np.ndarray]:
+    k = np.flatnonzero(qp.sense == EQUALITY)
+    np.testing.assert_array_equal(qp.lo[k], qp.hi[k])
+    return qp.A[k - nv], qp.lo[k]
+
+
+def soft_limits(qp, nv: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    k = np.flatnonzero(qp.sense == SOFT)
+    return qp.A[k - nv], qp.lo[k], qp.hi[k]
+
+
+def slope(ik: IK, q: np.ndarray, v: np.ndarray, f, step: float = STEP) -> np.ndarray:
+    """Derivative of f along the tangent vector v."""
+    kin = ik.kin
+    high, low = f(kin.integrate(q, step * v)), f(kin.integrate(q, -step * v))
+    return (np.array(high) - np.array(low)) / (2 * step)
+
+
+def jacobian(ik: IK, q: np.ndarray, f, step: float = STEP) -> np.ndarray:
+    return np.stack(
+        [slope(ik, q, e, f, step) for e in np.eye(ik.world.model.nv)], axis=-1
+    )
+
+
+def random_in_contact(ik: IK, problem, q, rng) -> np.ndarray:
+    """A random tangent vector that keeps all contacts closed."""
+    A, _ = hard_rows(ik.build(problem, q), ik.world.model.nv)
+    v = rng.normal(size=ik.world.model.nv)
+    return v - np.linalg.pinv(A) @ (A @ v) if len(A) else v
+
+
+# Hard rows: J dq = e with J = -de/dq.
+
+HELD = [
+    *[(s, p, {}) for s in BALLS for p in SUPPORTS],
+    *[(s, p, {"link": True}) for s in BALLS for p in SUPPORTS],
+    *[("LFoot", p, {}) for p in SUPPORTS],
+    *[("RFoot", p, {"edge": e}) for e in range(4) for p in ("ground", "tilted")],
+    *[("LKnee", p, {"free": True}) for p in SUPPORTS],
+    *[("RFoot", p, {"free": True}) for p in SUPPORTS],
+]
+ROWS = {"edge": 5, "flat": 6, "ball": 3, "free flat": 3, "free ball": 1}
+
+
+@pytest.mark.parametrize(("surface", "support", "kind"), HELD, ids=str)
+def test_rows_of_a_contact_are_the_derivative_of_its_error(ik, surface, support, kind):
+    w = ik.world
+    q = bent(w, 1)
+    ik.kin.update(q)
+    if kind.get("link"):
+        body = w.surfaces[surface].body
+        kind = {"link": quat_from_matrix(ik.kin.rotation(body))}
+    goal = goal_at(ik, q, surface, support, **kind)
+    problem = problem_of(w, goal)
+    nv = w.model.nv
+    J, e = hard_rows(ik.build(problem, q), nv)
+    name = "flat" if w.surfaces[surface].is_flat else "ball"
+    if "free" in kind:
+        name = "free " + name
+    assert len(J) == ROWS["edge" if "edge" in kind else name]
+    if "free" not in kind:
+        np.testing.assert_allclose(e, 0.0, atol=1e-7)  # the contact is closed
+    numeric = jacobian(ik, q, lambda x: -hard_rows(ik.build(problem, x), nv)[1])
+    np.testing.assert_allclose(J, numeric, atol=2e-7)
+    assert np.linalg.matrix_rank(J) == len(J)
+
+
+@pytest.mark.parametrize("surface", ["LHand", "LFoot"])
+def test_an_open_contact_asks_for_the_step_that_closes_it(ik, surface):
+    """J dq = e asks for p + J dq = target: the sign of e is that of the gap."""
+    q = bent(ik.world, 2)
+    goal = goal_at(ik, q, surface, "ground")
+    gap = np.array([0.03, -0.02, 0.04])
+    moved = replace(goal, position=goal.position + gap)
+    problem = problem_of(ik.world, moved)
+    J, e = hard_rows(ik.build(problem, q), ik.world.model.nv)
+    np.testing.assert_allclose(e[:3], gap, atol=1e-12)
+    ik.kin.update(q)
+    s = ik.world.surfaces[surface]
+    n = ik.world.supports["ground"].normal
+    p = ik.kin.contact_point(surface, n)
+    centre = p + s.radius * n
+    np.testing.assert_allclose(J[:3], ik.kin.point_jacobian(s.body, centre), atol=1e-12)
+
+
+def test_a_flat_contact_asks_for_the_turn_that_lays_it_flat(ik):
+    q = bent(ik.world, 3)
+    goal = goal_at(ik, q, "LFoot", "ground")
+    turn = np.array([0.02, -0.01, 0.03])
+    R = Rotation.from_rotvec(turn).as_matrix() @ goal.rotation
+    problem = problem_of(ik.world, replace(goal, rotation=R))
+    _, e = hard_rows(ik.build(problem, q), ik.world.model.nv)
+    np.testing.assert_allclose(e[3:], turn, atol=1e-9)
+
+
+def test_a_rolling_contact_follows_its_link_along_a_finite_turn(ik):
+    """Turned about one axis by much, the rows still predict how the error goes on."""
+    w = ik.world
+    q = w.home.copy()
+    ik.kin.update(q)
+    link = quat_from_matrix(ik.kin.rotation(w.surfaces["LKnee"].body))
+    goal = goal_at(ik, q, "LKnee", "ground", link=link)
+    problem = problem_of(w, goal)
+    v = np.zeros(w.model.nv)
+    v[[0, 4]] = 0.3, 0.8  # forwards, and the pelvis about its own y
+    nv = w.model.nv
+    later = ik.kin.integrate(q, v)
+    J, _ = hard_rows(ik.build(problem, later), nv)
+    numeric = slope(ik, later, v, lambda x: -hard_rows(ik.build(problem, x), nv)[1])
+    np.testing.assert_allclose(J @ v, numeric, atol=1e-7)
+
+
+def test_a_wheel_that_rolls_keeps_its_contact_closed(ik):
+    """The ball moves r theta while it turns by theta: no error at any angle."""
+    w = ik.world
+    ik.kin.update(w.home)
+    s = w.surfaces["LKnee"]
+    link = quat_from_matrix(ik.kin.rotation(s.body))
+    goal = goal_at(ik, w.home, "LKnee", "ground", link=link)
+    centre = ik.kin.point(s.body, s.centre).copy()
+    for theta in (-1.0, 0.3, 1.4):
+        R = Rotation.from_rotvec([0.0, theta, 0.0])
+        q = w.home.copy()
+        turned = R * Rotation.from_quat(w.home[3:7], scalar_first=True)
+        q[3:7] = turned.as_quat(scalar_first=True)
+        rolled = centre + np.array([s.radius * theta, 0.0, 0.0])
+        q[:3] = rolled + R.apply(w.home[:3] - centre)
+        residuals = ik.residuals(problem_of(w, goal), q)
+        assert residuals.contact == pytest.approx(0.0, abs=1e-9)
+        held = replace(goal, link=None)  # without rolling, that is an open contact
+        open_by = ik.residuals(problem_of(w, held), q).contact
+        assert open_by == pytest.approx(s.radius * abs(theta), abs=1e-9)
+
+
+# Soft tasks: c is the gradient of the cost, H its curvature where the task is met.
+
+
+def soft_problems(ik: IK, q: np.ndarray, off: float) -> dict[str, PostureProblem]:
+    """One task each; its error at `q` is of the size of `off` [m, rad]."""
+    w, kin = ik.world, ik.kin
+    turn = Rotation.from_rotvec(off * np.array([0.6, -0.5, 0.62])).as_matrix()
+    shift = off * np.array([0.5, -0.7, 0.5])
+
+    def moved(goal: ContactGoal) -> ContactGoal:
+        return replace(
+            goal, position=goal.position + shift, rotation=turn @ goal.rotation
+        )
+
+    problems = {
+        "target of a ball": problem_of(
+            w, moved(goal_at(ik, q, "LHand", "ground", hard=False, reference=2.0))
+        ),
+        "target of a foot": problem_of(
+            w, moved(goal_at(ik, q, "RFoot", "ground", hard=False, reference=3.0))
+        ),
+        "pelvis": problem_of(w, base_weight=0.4),
+        "posture": problem_of(w, posture_weight=0.3, q_reference=q.copy()),
+    }
+    knee = goal_at(ik, q, "LKnee", "tilted", free=True, reference=1.5)
+    problems["reference of a free contact"] = problem_of(w, moved(knee))
+    kin.update(q)
+    R_WB = turn @ kin.rotation(w.base)
+    problems["pelvis"] = replace(problems["pelvis"], base_rotation=R_WB)
+    reference = q.copy()
+    reference[w.qadr] += off * np.linspace(-1.0, 1.0, len(w.qadr))
+    problems["posture"] = replace(problems["posture"], q_reference=reference)
+
+    def unit(a: str, b: str) -> np.ndarray:
+        d = kin.landmark(b)[1] - kin.landmark(a)[1]
+        return turn @ d / np.linalg.norm(d)
+
+    limbs = w.robot.limbs
+    for name, limb, a, b in (
+        ("left_upper_arm", "left_arm", "root", "middle"),
+        ("right_forearm", "right_arm", "middle", "end"),
+        ("right_thigh", "right_leg", "root", "middle"),
+        ("left_shank", "left_leg", "middle", "end"),
+    ):
+        u = unit(getattr(limbs[limb], a), getattr(limbs[limb], b))
+        problems[name] = problem_of(w, directions={name: u}, direction_weight=0.5)
+    middle = {
+        n: 0.5
+        * (
+            kin.landmark(limbs[f"left_{n}"].root)[1]
+            + kin.landmark(limbs[f"right_{n}"].root)[1]
+        )
+        for n in ("arm", "leg")
+    }
+    trunk = middle["arm"] - middle["leg"]
+    u = turn @ trunk / np.linalg.norm(trunk)
+    problems["trunk"] = problem_of(w, directions={"trunk": u}, direction_weight=0.5)
+    s = w.surfaces["RHand"]
+    arm = kin.landmark(limbs["right_arm"].root)[1] - kin.point(s.body, s.centre)
+    lean = turn @ arm / np.linalg.norm(arm)
+    problems["lean"] = problem_of(w, lean=("RHand", lean, 0.7))
+    return problems
+
+
+SOFT_TASKS = (
+    "target of a ball",
+    "target of a foot",
+    "reference of a free contact",
+    "pelvis",
+    "posture",
+    "left_upper_arm",
+    "right_forearm",
+    "right_thigh",
+    "left_shank",
+    "trunk",
+    "lean",
+)
+# Rotation errors and lengths that are frozen while a step is taken leave second-order
+# terms: the gradient of the cost may be off by this share of the error.
+TOLERANCE = {
+    "target of a ball": 1e-6,
+    "posture": 1e-6,
+    "reference of a free contact": 1e-4,
+}
+
+
+def posture_for(ik: IK, task: str) -> np.ndarray:
+    """A bent posture; a free contact touches its support, else the merit counts it."""
+    q = bent(ik.world, 4)
+    if task == "reference of a free contact":
+        ik.kin.update(q)
+        s = ik.world.supports["tilted"]
+        q[:3] += s.position - ik.kin.contact_point("LKnee", s.normal)
+    return q
+
+
+@pytest.mark.parametrize("task", SOFT_TASKS)
+def test_the_linear_term_is_the_gradient_of_the_cost(ik, task):
+    off = 0.02
+    q = posture_for(ik, task)
+    problem = soft_problems(ik, q, off)[task]
+    qp = ik.build(problem, q)
+    numeric = jacobian(ik, q, lambda x: ik.build(problem, x).merit, 1e-5)
+    size = np.abs(numeric).max()
+    assert size > 1e-5
+    tolerance = TOLERANCE.get(task, 1.5 * off)
+    np.testing.assert_allclose(qp.c, numeric, atol=tolerance * size)
+
+
+@pytest.mark.parametrize("task", SOFT_TASKS)
+def test_the_quadratic_term_is_the_curvature_where_the_task_is_met(ik, task, rng):
+    w, h = ik.world, 1e-5
+    q = posture_for(ik, task)
+    problem = soft_problems(ik, q, 0.0)[task]
+    qp = ik.build(problem, q)
+    assert qp.merit == pytest.approx(0.0, abs=1e-12)
+    for _ in range(5):
+        v = random_in_contact(ik, problem, q, rng)
+        if task == "trunk":
+            v[6:9] = 0.0  # the waist changes the trunk's length, which is held still
+        if task == "lean":
+            v[9:] = 0.0  # so do the arm's joints; the base turns it as a whole
+        ends = [
+            ik.build(problem, ik.kin.integrate(q, s * h * v)).merit for s in (1, -1)
+        ]
+        curvature = sum(ends) / h**2
+        expected = v @ (qp.H - DAMPING * np.eye(w.model.nv)) @ v
+        assert expected == pytest.approx(curvature, rel=2e-3)
+        assert curvature > 0
+
+
+def test_stability_is_weighted_so_that_its_cost_is_that_of_the_method(ik):
+    """(4.25): w || X - S ||^2, X where the contact is, S under the shoulder."""
+    w, weight = ik.world, 5.0
+    q = bent(w, 6)
+    goal = goal_at(ik, q, "LHand", "ground", free=True, stability=weight)
+    data = mujoco.MjData(w.model)
+
+    def cost(x: np.ndarray) -> float:
+        data.qpos[:] = x
+        mujoco.mj_kinematics(w.model, data)
+        e = data.geom("LHand").xpos[:2] - data.body("LShr").xpos[:2]
+        return weight * float(e @ e)
+
+    qp = ik.build(problem_of(w, goal), q)
+    np.testing.assert_allclose(qp.c, jacobian(ik, q, cost), atol=1e-7)
+
+
+def test_joints_that_are_no_robots_have_no_preferred_posture(ik):
+    w = ik.world
+    problem = problem_of(w, posture_weight=0.5)
+    q = w.home.copy()
+    q[:3] += 0.3
+    qp = ik.build(problem, q)
+    np.testing.assert_array_equal(qp.c, 0.0)  # the base may be anywhere
+    np.testing.assert_allclose(np.diag(qp.H)[:6], DAMPING)
+    np.testing.assert_allclose(np.diag(qp.H)[6:], DAMPING + 0.25)
+
+
+# Bounds, balance, distances.
+
+
+@pytest.mark.parametrize("support", SUPPORTS)
+@pytest.mark.parametrize("surface", ["LHand", "LKnee", "RFoot"])
+def test_a_free_contact_stays_inside_its_support(ik, surface, support, rng):
+    w = ik.world
+    s = w.supports[support]
+    q = bent(w, 7)
+    if support != "ground":
+        # Bring the surface near a corner of the top: two sides matter.
+        ik.kin.update(q)
+        corner = s.position + s.rotation[:, :2] @ (s.polygon[2] * 0.9)
+        q[:3] += corner - ik.kin.contact_point(surface, s.normal)
+    problem = problem_of(w, goal_at(ik, q, surface, support, free=True))
+    nv = w.model.nv
+    A, lo, hi = soft_limits(ik.build(problem, q), nv)
+    if support == "ground":
+        assert len(A) == 0  # its border is far away
+        return
+    assert len(A) >= 2
+    assert np.all(lo < -1e29)
+    numeric = jacobian(ik, q, lambda x: -soft_limits(ik.build(problem, x), nv)[2])
+    np.testing.assert_allclose(A, numeric, atol=2e-7)
+    ik.kin.update(q)
+    points = ik.kin.bearing_points(surface, s.normal)
+    rooms = (s.edges()[1] - EDGE_INSET - points @ s.edges()[0].T).ravel()
+    np.testing.assert_allclose(np.sort(hi), np.sort(rooms[rooms < 0.15]), atol=1e-9)
+
+
+def halfplane_rooms(points: np.ndarray, com: np.ndarray) -> np.ndarray:
+    """Signed distances from `com` to the sides of the hull, by Qhull."""
+    hull = ConvexHull(points)
+    return -(hull.equations[:, :2] @ com + hull.equations[:, 2])
+
+
+STANCES = {
+    "both feet": {"LFoot": {}, "RFoot": {}},
+    "feet and a rolling hand": {"LFoot": {}, "RFoot": {}, "LHand": {"link": True}},
+    "feet and a hand": {"LFoot": {}, "RFoot": {}, "RHand": {}},
+    "foot and elbows": {"LFoot": {}, "LElbow": {"link": True}, "RElbow": {}},
+    "a free hand": {"LFoot": {}, "RFoot": {}, "LHand": {"free": True}},
+    "a free foot": {"LFoot": {}, "RFoot": {"free": True}},
+    "four balls": {n: {"link": True} for n in ("LKnee", "RKnee", "LElbow", "RElbow")},
+    "an edge of a foot": {"LFoot": {"edge": 0}, "RKnee": {}, "RHand": {"link": True}},
+}
+
+
+def stance(ik: IK, q: np.ndarray, name: str, support: str, **changes) -> PostureProblem:
+    goals = []
+    for surface, given in STANCES[name].items():
+        kind = dict(given)
+        if kind.get("link"):
+            ik.kin.update(q)
+            body = ik.world.surfaces[surface].body
+            kind["link"] = quat_from_matrix(ik.kin.rotation(body))
+        goals.append(goal_at(ik, q, surface, support, **kind))
+    return problem_of(ik.world, *goals, balance=True, **changes)
+
+
+@pytest.mark.parametrize("support", ["ground", "tilted"])
+@pytest.mark.parametrize("name", STANCES)
+def test_balance_rows_follow_the_centre_of_mass_and_the_polygon(ik, name, support, rng):
+    """Along motions that keep the contacts, the distance to each side changes so."""
+    w, nv = ik.world, ik.world.model.nv
+    n = w.supports[support].normal
+    q = bent(w, 8)
+    ik.kin.update(q)  # the left foot lies flat, so that it can roll on an edge
+    sole = ik.kin.rotation(w.surfaces["LFoot"].body) @ w.surfaces["LFoot"].rotation
+    lay = frame_from_normal(n, sole[:, 0]) @ sole.T
+    q[3:7] = quat_from_matrix(lay @ ik.kin.rotation(w.base))
+    problem = stance(ik, q, name, support, balance_margin=0.03)
+
+    def rooms(x: np.ndarray) -> np.ndarray:
+        ik.kin.update(x)
+        points = [
+            ik.kin.bearing_points(g.surface, n, g.edge)[:, :2] for g in problem.goals
+        ]
+        return halfplane_rooms(np.concatenate(points), ik.kin.com[:2]) - 0.03
+
+    def balance(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        A, _, hi = soft_limits(ik.build(problem, x), nv)
+        m = len(rooms(x))
+        return A[-m:], hi[-m:]
+
+    A, hi = balance(q)
+    np.testing.assert_allclose(np.sort(hi), np.sort(rooms(q)), atol=1e-9)
+    for _ in range(5):
+        v = random_in_contact(ik, problem, q, rng)
+        # The hull lies on a grid of a nanometre: steps must be long against that.
+        numeric = slope(ik, q, v, lambda x: -balance(x)[1], step=1e-4)
+        np.testing.assert_allclose(A @ v, numeric, atol=5e-5)
+
+
+def test_the_centre_of_mass_is_drawn_to_the_middle_of_the_polygon(ik):
+    """Per step the polygon is held still; its middle is the mean of the corners."""
+    w = ik.world
+    problem = stance(ik, w.home, "both feet", "ground", com_weight=0.6)
+    qp = ik.build(problem, w.home)
+    ik.kin.update(w.home)
+    feet = np.concatenate([ik.kin.bearing_points(f, UP) for f in ("LFoot", "RFoot")])
+    middle = feet[ConvexHull(feet[:, :2]).vertices, :2].mean(axis=0)
+    e = ik.kin.com[:2] - middle
+    J = ik.kin.com_jacobian()[:2]
+    np.testing.assert_allclose(qp.c, 0.36 * J.T @ e, atol=1e-9)
+    assert qp.merit == pytest.approx(0.18 * e @ e)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_distance_rows_are_the_derivatives_of_distances(ik, seed, rng):
+    w, nv = ik.world, ik.world.model.nv
+    q = bent(w, 20 + seed)
+    problem = problem_of(w, clearance=base_clearance(w, 0.02))
+    A, lo, hi = soft_limits(ik.build(problem, q), nv)
+    assert np.all(hi > 1e29)
+    ik.kin.update(q)
+    near = ik.kin.proximity(0.10)
+    assert len(A) == len(near.pairs) > 10
+    np.testing.assert_array_equal(lo, 0.02 - near.distance)
+    v, checked = rng.normal(size=nv), 0
+    data, ends = mujoco.MjData(w.model), []
+    for sign in (1, -1):
+        data.qpos[:] = ik.kin.integrate(q, sign * 1e-5 * v)
+        mujoco.mj_kinematics(w.model, data)
+        ends.append(
+            [
+                mujoco.mj_geomDistance(w.model, data, *map(int, w.pairs[i]), 1.0, None)
+                for i in near.pairs
+            ]
+        )
+    for row, d, high, low in zip(A, near.distance, *ends, strict=True):
+        rates = np.array([high - d, d - low]) / 1e-5
+        if d > 1e-3 and abs(rates[0] - rates[1]) < 1e-2:  # no penetration, no kink
+            assert row @ v == pytest.approx(rates.mean(), abs=2e-3)
+            checked += 1
+    assert checked > 8
+
+
+def test_pairs_without_a_clearance_have_no_row(ik):
+    w = ik.world
+    clearance = base_clearance(w, 0.02)
+    q = bent(w, 20)
+    every = len(ik.build(problem_of(w, clearance=clearance), q).A)
+    ik.kin.update(q)
+    near = ik.kin.proximity(0.10).pairs
+    clearance[near[:4]] = -np.inf
+    assert len(ik.build(problem_of(w, clearance=clearance), q).A) == every - 4
+
+
+def test_a_surface_may_touch_the_support_it_stands_on_and_no_other(ik):
+    w = ik.world
+    free = base_clearance(w, 0.01)
+    allowed = contact_clearance(w, free, {"LKnee": "yawed", "RFoot": "ground"})
+    name = w.model.geom
+    changed = {}
+    for (a, b), c in zip(w.pairs, allowed, strict=True):
+        if c != 0.01:
+            changed[frozenset((name(int(a)).name, name(int(b)).name))] = c
+    assert changed == {
+        frozenset(("LKnee", "yawed")): -np.inf,  # left to the contact task
+        frozenset(("LKnee_shin", "yawed")): 0.0,  # may touch, not enter
+        frozenset(("RFoot", "ground")): -np.inf,
+    }
+    np.testing.assert_array_equal(free, 0.01)
+    rolling = contact_clearance(w, free, {"RFoot": "ground"}, rolling=("RFoot",))
+    assert sorted(set(rolling.tolist())) == [0.0, 0.01]
+
+
+# Bounds on joints and steps, and the QP's solution.
+
+
+def stance_problem(plain: IK, **changes) -> PostureProblem:
+    """Feet where they stand, the left hand on the box, everything else switched on."""
+    w = plain.world
+    feet = [goal_at(plain, w.home, f, "ground") for f in ("LFoot", "RFoot")]
+    hand = ContactGoal(
+        surface="LHand",
+        support="box",
+        position=np.array([0.38, 0.17, 0.275]),
+        rotation=np.eye(3),
+        free=True,
+        stability=5.0,
+        reference=1.5,
+    )
+    where = {"LFoot": "ground", "RFoot": "ground", "LHand": "box"}
+    usual = {
+        "goals": (*feet, hand),
+        "q_reference": w.home,
+        "clearance": contact_clearance(w, base_clearance(w, 0.01), where),
+        "directions": {"trunk": np.array([0.5, 0.0, np.sqrt(0.75)])},
+        "direction_weight": 0.2,
+    }
+    return PostureProblem(**(usual | changes))
+
+
+def test_bounds_are_the_room_left_to_the_limits(ik):
+    w = ik.world
+    q = bent(w, 9)
+    qp = ik.build(problem_of(w), q)
+    np.testing.assert_allclose(qp.lo[w.dadr], w.q_min[w.dadr] - q[w.qadr])
+    np.testing.assert_allclose(qp.hi[w.dadr], w.q_max[w.dadr] - q[w.qadr])
+    assert np.all(qp.lo[:6] < -1e29)
+    assert np.all(qp.hi[:6] > 1e29)
+
+
+@pytest.mark.parametrize("radius", [1.0, 0.1])
+def test_a_step_stays_within_its_trust_region(plain, radius):
+    problem = stance_problem(plain)
+    dq = plain.step(plain.build(problem, plain.world.home), radius)
+    largest = np.r_[np.full(3, STEP_TRANSLATION), np.full(26, STEP_ROTATION)] * radius
+    assert np.all(np.abs(dq) <= largest + 1e-9)
+    assert np.any(np.abs(dq) > 0.99 * largest)  # and would go farther
+
+
+def near_solution(plain: IK, problem: PostureProblem, rng) -> np.ndarray:
+    """A posture from which one step can satisfy every constraint."""
+    q = plain.solve(problem, plain.world.home).q
+    return plain.kin.integrate(q, 0.01 * rng.normal(size=plain.world.model.nv))
+
+
+def as_qp(qp, q_limits: tuple[np.ndarray, np.ndarray], nv: int):
+    """min 1/2 x'Hx + c'x, G x <= h, A x = b, lb <= x <= ub as others write it."""
+    k = qp.sense[nv:] == EQUALITY
+    upper, lower = qp.hi[nv:] < 1e29, qp.lo[nv:] > -1e29
+    G = np.concatenate([qp.A[~k & upper], -qp.A[~k & lower]])
+    h = np.concatenate([qp.hi[nv:][~k & upper], -qp.lo[nv:][~k & lower]])
+    return G, h, qp.A[k], qp.lo[nv:][k], *q_limits
+
+
+def test_a_step_satisfies_the_kkt_conditions(plain, rng):
+    """H x + c + A' y + G' z = 0, z >= 0 on what is active, found by least squares."""
+    nv = plain.world.model.nv
+    problem = stance_problem(plain)
+    qp = plain.build(problem, near_solution(plain, problem, rng))
+    x = plain.step(qp)
+    step = np.r_[np.full(3, STEP_TRANSLATION), np.full(nv - 3, STEP_ROTATION)]
+    bounds = np.maximum(qp.lo[:nv], -step), np.minimum(qp.hi[:nv], step)
+    G, h, A, b, lb, ub = as_qp(qp, bounds, nv)
+    np.testing.assert_allclose(A @ x, b, atol=1e-6)
+    assert np.all(G @ x <= h + 1e-5)
+    assert np.all(x >= lb - 1e-6)
+    assert np.all(x <= ub + 1e-6)
+    active = G[G @ x > h - 1e-5]
+    sides = np.concatenate([np.eye(nv)[x > ub - 1e-6], -np.eye(nv)[x < lb + 1e-6]])
+    columns = np.concatenate([A, -A, active, sides]).T
+    _, residual = nnls(columns, -(qp.H @ x + qp.c), maxiter=2000)
+    assert residual < 1e-5
+
+
+def test_a_step_is_the_one_that_another_solver_finds(plain, rng):
+    others = [s for s in ("quadprog", "clarabel", "proxqp", "piqp", "osqp", "scs")]
+    solver = next((s for s in others if s in qpsolvers.available_solvers), None)
+    if solver is None:
+        solver = "daqp"
+    nv = plain.world.model.nv
+    problem = stance_problem(plain)
+    step = np.r_[np.full(3, STEP_TRANSLATION), np.full(nv - 3, STEP_ROTATION)]
+    for _ in range(3):
+        qp = plain.build(problem, near_solution(plain, problem, rng))
+        x = plain.step(qp)
+        bounds = np.maximum(qp.lo[:nv], -step), np.minimum(qp.hi[:nv], step)
+        G, h, A, b, lb, ub = as_qp(qp, bounds, nv)
+        other = qpsolvers.solve_qp(qp.H, qp.c, G, h, A, b, lb, ub, solver=solver)
+        assert other is not None
+        np.testing.assert_allclose(x, other, atol=2e-5)
+
+
+def test_contacts_that_contradict_one_another_give_a_step_all_the_same(ik):
+    w = ik.world
+    q = w.home
+    here = goal_at(ik, q, "LFoot", "ground")
+    there = replace(here, position=here.position + np.array([0.04, 0.0, 0.0]))
+    problem = problem_of(w, here, there)
+    dq = ik.step(ik.build(problem, q))
+    assert np.all(np.isfinite(dq))
+    ik.kin.update(ik.kin.integrate(q, dq))
+    p = ik.kin.contact_point("LFoot", UP)
+    np.testing.assert_allclose(p, (here.position + there.position) / 2, atol=2e-3)
+
+
+def test_joint_limits_hold_at_every_iteration(plain):
+    w = plain.world
+    far = ContactGoal(  # asks for more than the joints can give
+        surface="LHand",
+        support="box",
+        position=np.array([1.0, -0.6, 0.275]),
+        rotation=np.eye(3),
+    )
+    problem = stance_problem(plain, goals=(*stance_problem(plain).goals[:2], far))
+    q, at_limit = w.home, 0
+    for _ in range(25):
+        q = plain.kin.integrate(q, plain.step(plain.build(problem, q)))
+        room = np.minimum(q[w.qadr] - w.q_min[w.dadr], w.q_max[w.dadr] - q[w.qadr])
+        assert room.min() > -1e-9
+        at_limit = max(at_limit, int(np.sum(room < 1e-6)))
+    assert at_limit >= 3
+
+
+# Whole solves.
+
+
+def measured(world: World, problem: PostureProblem, q: np.ndarray) -> dict[str, float]:
+    """What `Residuals` say, computed from plain MuJoCo and the geoms by name."""
+    m, data = world.model, mujoco.MjData(world.model)
+    data.qpos[:] = q
+    mujoco.mj_forward(m, data)
+    contact, points = 0.0, []
+    for g in problem.goals:
+        support = world.supports[g.support]
+        geom = data.geom(g.surface)
+        R = geom.xmat.reshape(3, 3)
+        size = m.geom(g.surface).size
+        if g.surface.endswith("Foot"):
+            p = geom.xpos - R[:, 2] * size[2]
+            signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+            bearing = p + (signs * size[:2]) @ R[:, :2].T
+            tilt = np.arccos(np.clip((np.trace(R @ g.rotation.T) - 1) / 2, -1, 1))
+            contact = max(contact, float(tilt))
+        else:
+            p = geom.xpos - size[0] * support.normal
+            bearing = p[None]
+        points.append(bearing)
+        gap = p - g.position
+        contact = max(
+            contact, abs(gap @ support.normal) if g.free else float(np.linalg.norm(gap))
+        )
+    hull = ConvexHull(np.concatenate(points)[:, :2])
+    com = data.subtree_com[m.body("Waist").id]
+    margin = -float((hull.equations @ np.r_[com[:2], 1.0]).max())
+    short = max(
+        c - mujoco.mj_geomDistance(m, data, int(a), int(b), 0.5, None)
+        for (a, b), c in zip(world.pairs, problem.clearance, strict=True)
+        if np.isfinite(c)
+    )
+    return {"contact": contact, "com_margin": margin, "distance": max(short, 0.0)}
+
+
+def test_a_simple_stance_is_solved_and_plain_mujoco_agrees(plain):
+    problem = stance_problem(plain)
+    solution = plain.solve(problem, plain.world.home)
+    assert solution.status is Status.SOLVED
+    truth = measured(plain.world, problem, solution.q)
+    r = solution.residuals
+    assert truth["contact"] < 5e-4
+    assert truth["distance"] < 2e-3
+    assert truth["com_margin"] > 0.025 - 2e-3
+    assert r.com_margin == pytest.approx(truth["com_margin"], abs=1e-9)
+    assert r.contact == pytest.approx(truth["contact"], abs=1e-6)
+    assert r.distance == pytest.approx(truth["distance"], abs=1e-9)
+    assert r.limits == 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_residuals_are_what_plain_mujoco_measures_anywhere(plain, seed):
+    problem = stance_problem(plain)
+    q = bent(plain.world, seed)
+    r, truth = plain.residuals(problem, q), measured(plain.world, problem, q)
+    for name, value in truth.items():
+        assert getattr(r, name) == pytest.approx(value, abs=1e-7), name
+    assert r.balance == pytest.approx(max(0.025 - truth["com_margin"], 0.0), abs=1e-9)
+    assert r.worst >= max(r.contact, r.distance)
+    if r.distance > 0:
+        a, b = map(int, plain.world.pairs[r.worst_pair])
+        d = mujoco.mj_geomDistance(
+            plain.world.model, plain.kin.data, a, b, 0.5, np.zeros(6)
+        )
+        assert problem.clearance[r.worst_pair] - d == pytest.approx(r.distance)
+
+
+def test_residuals_notice_any_clearance(plain):
+    """Also one that is larger than what is usual: the feet are 45 mm apart."""
+    w = plain.world
+    feet = [w.model.geom(f).id for f in ("LFoot", "RFoot")]
+    pair = np.isin(w.pairs, feet).all(axis=1)
+    problem = stance_problem(plain, clearance=np.where(pair, 0.06, -np.inf))
+    problem = replace(problem, goals=problem.goals[:2])
+    r = plain.residuals(problem, w.home)
+    assert r.distance == pytest.approx(0.06 - 0.0452, abs=1e-6)
+    assert pair[r.worst_pair]
+    assert r.status is Status.COLLIDING
+
+
+def test_limits_that_are_exceeded_are_measured(plain):
+    w = plain.world
+    q = w.home.copy()
+    q[w.qadr[0]] = w.q_max[w.dadr[0]] + 0.02
+    r = plain.residuals(stance_problem(plain), q)
+    assert r.limits == pytest.approx(0.02)
+    assert r.status is Status.UNREACHABLE
+
+
+def test_a_contact_out_of_reach_is_unreachable(plain):
+    far = ContactGoal(
+        surface="LHand",
+        support="box",
+        position=np.array([1.2, 0.5, 0.275]),
+        rotation=np.eye(3),
+    )
+    problem = stance_problem(plain, goals=(*stance_problem(plain).goals[:2], far))
+    solution = plain.solve(problem, plain.world.home)
+    assert solution.status is Status.UNREACHABLE
+    truth = measured(plain.world, problem, solution.q)
+    assert solution.residuals.contact == pytest.approx(truth["contact"], abs=1e-6)
+    assert truth["contact"] > 0.1
+
+
+def test_a_margin_that_no_stance_has_is_unbalanced(plain):
+    w = plain.world
+    feet = stance_problem(plain).goals[:2]
+    clearance = contact_clearance(
+        w, base_clearance(w, 0.01), {"LFoot": "ground", "RFoot": "ground"}
+    )
+    problem = stance_problem(
+        plain, goals=feet, clearance=clearance, balance_margin=0.15
+    )
+    solution = plain.solve(problem, w.home)
+    assert solution.status is Status.UNBALANCED
+    # As near to it as the feet allow: their hull is 0.20 m long.
+    assert solution.residuals.com_margin == pytest.approx(0.1, abs=0.005)
+
+
+def test_feet_that_must_stand_too_close_collide(plain):
+    w = plain.world
+    left, right, _ = stance_problem(plain).goals
+    near = replace(left, position=right.position + np.array([0.0, 0.08, 0.0]))
+    where = {"LFoot": "ground", "RFoot": "ground"}
+    clearance = contact_clearance(w, base_clearance(w, 0.01), where)
+    problem = stance_problem(plain, goals=(near, right), clearance=clearance)
+    solution = plain.solve(problem, w.home)
+    # Feet that overlap satisfy neither: whichever gives way, it is not called solved.
+    assert solution.status in (Status.COLLIDING, Status.UNREACHABLE)
+    a, b = (w.model.geom(int(g)).name for g in w.pairs[solution.residuals.worst_pair])
+    assert {a, b} == {"LFoot", "RFoot"}
+
+
+def test_the_same_question_has_the_same_answer_to_the_bit(plain):
+    problem = stance_problem(plain)
+    first = plain.solve(problem, plain.world.home)
+    other = stance_problem(plain, direction_weight=0.0, balance_margin=0.05)
+    plain.solve(other, first.q)  # whatever the workspace was used for in between
+    again = plain.solve(problem, plain.world.home)
+    fresh = IK(plain.world).solve(problem, plain.world.home)
+    for s in (again, fresh):
+        np.testing.assert_array_equal(s.q, first.q)
+        assert s.iterations == first.iterations
+        assert s.residuals.worst == first.residuals.worst
+
+
+def test_asking_leaves_question_and_start_as_they_were(plain):
+    w = plain.world
+    problem = stance_problem(plain)
+    home, clearance = w.home.copy(), problem.clearance.copy()
+    positions = [g.position.copy() for g in problem.goals]
+    plain.solve_hard(problem, w.home)
+    np.testing.assert_array_equal(w.home, home)
+    np.testing.assert_array_equal(problem.clearance, clearance)
+    for g, p in zip(problem.goals, positions, strict=True):
+        np.testing.assert_array_equal(g.position, p)
+
+
+def test_a_solved_posture_stays_solved_wherever_the_world_is_turned(rng):
+    """Turn scene, start and goals about the vertical: the joints are the same."""
+    yaw, at = 0.8, np.array([0.7, -0.4])
+    R = matrix_from_rpy([0.0, 0.0, yaw])
+    here = IK(build_world(load_robot("coman"), Scene.from_height(0.275)))
+    box = here.world.scene.boxes[0]
+    turned = Box(
+        name="box",
+        size=box.size,
+        position=R @ box.position + [*at, 0.0],
+        rotation=R,
+    )
+    scene = Scene(boxes=(turned,), start=np.array([*at, yaw]))
+    there = IK(build_world(load_robot("coman"), scene))
+    problem = stance_problem(here)
+    moved = stance_problem(
+        there,
+        directions={n: R @ u for n, u in problem.directions.items()},
+    )
+    hand = problem.goals[2]
+    moved_hand = replace(
+        hand, position=R @ hand.position + [*at, 0.0], rotation=R @ hand.rotation
+    )
+    moved = replace(moved, goals=(*moved.goals[:2], moved_hand))
+    a = here.solve(problem, here.world.home)
+    b = there.solve(moved, there.world.home)
+    assert a.status is b.status is Status.SOLVED
+    np.testing.assert_allclose(a.q[7:], b.q[7:], atol=2e-3)
+    assert a.residuals.com_margin == pytest.approx(b.residuals.com_margin, abs=1e-3)
+
+
+def test_solve_hard_never_does_worse(plain):
+    for x in (0.36, 0.5, 0.62):
+        hand = replace(
+            stance_problem(plain).goals[2],
+            position=np.array([x, -0.05, 0.275]),
+            free=False,
+        )
+        problem = stance_problem(plain, goals=(*stance_problem(plain).goals[:2], hand))
+        easy = plain.solve(problem, plain.world.home)
+        hard = plain.solve_hard(problem, plain.world.home)
+        assert hard.residuals.worst <= easy.residuals.worst
+        assert hard.iterations >= easy.iterations
+
+
+def test_an_exact_log_is_used_for_large_turns(ik):
+    """A pelvis turned by 2 rad is asked to come back by 2 rad, not by sin 2."""
+    w = ik.world
+    R = matrix_from_rpy([0.0, 0.0, 2.0])
+    problem = problem_of(w, base_rotation=R, base_weight=1.0)
+    qp = ik.build(problem, w.home)
+    ik.kin.update(w.home)
+    e = rotation_vector(R @ ik.kin.rotation(w.base).T)
+    assert qp.merit == pytest.approx(0.5 * e @ e)
+    assert np.linalg.norm(e) == pytest.approx(2.0, abs=0.2)
+
+
+def test_kinematics_of_the_workspace_are_left_at_the_posture(ik):
+    w = ik.world
+    q = bent(w, 12)
+    ik.build(problem_of(w), q)
+    np.testing.assert_array_equal(ik.kin.q, q)
+    fresh = Kinematics(w)
+    fresh.update(q)
+    np.testing.assert_array_equal(ik.kin.com, fresh.com)
