@@ -566,7 +566,7 @@ def _outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
         return "planned to the last stance"
-    missed = [s.reason for s in plan.skipped if " -> " in s.reason]
+    missed = [s.reason for s in plan.skipped if s.missed]
     why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
     return f"the robot cannot do it: {why}"
 

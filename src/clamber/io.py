@@ -525,6 +525,7 @@ class _KeyframeFile(pydantic.BaseModel):
 class _SkippedFile(pydantic.BaseModel):
     stance: int
     reason: str
+    missed: bool = False
 
 
 class _PlanFile(pydantic.BaseModel):
@@ -770,7 +771,7 @@ def _robot(file: RobotFile) -> Robot:
 def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
     try:
         model = mujoco.MjSpec.from_file(str(path)).compile()
-        world = clamber.model._index(model, path.read_text(), robot, scene)
+        world = clamber.model.index_world(model, path.read_text(), robot, scene)
         for limb in robot.limbs.values():
             for name in (limb.root, limb.middle, limb.end):
                 world.landmark(name)

@@ -336,8 +336,10 @@ def build_world(robot: Robot, scene: Scene) -> World:
     spec.compile()
     xml = spec.to_xml()
     # Written numbers are rounded: plan with what a reader of the file will simulate.
-    model = mujoco.MjSpec.from_string(xml).compile()
-    return _index(model, xml, robot, scene)
+    again = mujoco.MjSpec.from_string(xml)
+    again.modelfiledir = str(robot.path.parent)
+    model = again.compile()
+    return index_world(model, xml, robot, scene)
 
 
 def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
@@ -421,8 +423,15 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
         )
 
 
-def _index(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World:
-    """Look everything up once."""
+def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World:
+    """The world of a compiled model, everything looked up once.
+
+    Args:
+        model: Of `xml`.
+        xml: As `build_world` wrote it.
+        robot: That is in it.
+        scene: That is around it.
+    """
     base = model.body(robot.base).id
     hinges = [
         j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE

@@ -45,10 +45,17 @@ class Step:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Skipped:
-    """A stance of the demonstration that is no keyframe, and why."""
+    """A stance of the demonstration that is no keyframe, and why.
+
+    Attributes:
+        stance: Its index in the sequence.
+        reason: For people.
+        missed: A way was looked for and not found; otherwise there was nothing to do.
+    """
 
     stance: int
     reason: str
+    missed: bool = False
 
 
 def split_moves(

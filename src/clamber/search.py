@@ -96,7 +96,7 @@ def plan_steps(
             better = repair(ik, keyframes, paths, step.move)
             lap("repairs")
         if better is None:
-            missed[k] = Skipped(stance=step.stance, reason=result)
+            missed[k] = Skipped(stance=step.stance, reason=result, missed=True)
             k += 1
             continue
         repairs += 1
