@@ -1,0 +1,330 @@
+"""What physics makes of a plan, and what the verdict says about it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from clamber.model import PHYSICS_STEP, build_world
+from clamber.scene import Scene
+from clamber.simulation import (
+    END_SPEED,
+    GOAL_TOL,
+    HEIGHT_TOL,
+    OVERLAP_TOL,
+    SHARE_ON_PLAN,
+    TILT_TOL,
+    UNINTENDED_TOL,
+    YAW_TOL,
+    deepest_self_overlap,
+    judge,
+    simulate,
+)
+
+
+@pytest.fixture(scope="module")
+def start_only(demo_plan):
+    """A plan whose trajectory ends after two seconds: quick to run."""
+    t = demo_plan.trajectory
+    cut = {n: getattr(t, n)[:2000] for n in ("time", "q", "v", "tau", "contact")}
+    return replace(demo_plan, trajectory=replace(t, **cut))
+
+
+def failed(plan, rollout) -> set[str]:
+    return {n for n, c in judge(plan, rollout).criteria.items() if not c.ok}
+
+
+def turned(q: np.ndarray, axis: int, angle: float) -> np.ndarray:
+    """The base rotated about an axis of the world."""
+    out, turn = q.copy(), np.zeros(4)
+    turn[0], turn[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
+    mujoco.mju_mulQuat(out[3:7], turn, q[3:7])
+    return out
+
+
+def with_last(rollout, q):
+    return replace(rollout, qpos=np.vstack([rollout.qpos[:-1], q]))
+
+
+# The rollout is physics and nothing else.
+
+
+def test_plain_mujoco_arrives_at_the_same_states_from_the_written_scene(
+    demo_plan, demo_rollout
+):
+    model = mujoco.MjModel.from_xml_string(demo_plan.world.xml)
+    data = mujoco.MjData(model)
+    data.qpos[:] = demo_rollout.qpos[0]
+    for k, ctrl in enumerate(demo_rollout.ctrl):
+        row, rest = divmod(k, demo_rollout.stride)
+        if rest == 0:
+            assert np.array_equal(data.qpos, demo_rollout.qpos[row])
+            assert np.array_equal(data.qvel, demo_rollout.qvel[row])
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data)
+
+
+def test_it_starts_at_rest_where_the_plan_does(demo_plan, demo_rollout):
+    assert np.array_equal(demo_rollout.qpos[0], demo_plan.trajectory.q[0])
+    assert not demo_rollout.qvel[0].any()
+
+
+def test_there_is_a_command_for_every_sample_and_a_state_for_every_tenth(
+    demo_plan, demo_rollout
+):
+    n = len(demo_plan.trajectory.time)
+    assert demo_rollout.ctrl.shape == (n, demo_plan.world.model.nu)
+    assert demo_rollout.stride == 10
+    assert len(demo_rollout.time) == len(demo_rollout.qpos) == -(-n // 10)
+    assert np.allclose(np.diff(demo_rollout.time), 10 * PHYSICS_STEP)
+
+
+def test_two_runs_are_the_same_to_the_last_bit(start_only):
+    a, b = simulate(start_only), simulate(start_only)
+    for name in ("ctrl", "qpos", "qvel", "actuator_force", "contact_force"):
+        assert np.array_equal(getattr(a, name), getattr(b, name))
+    assert a.end_share == b.end_share
+
+
+def test_the_beginning_does_not_depend_on_the_end(start_only, demo_rollout):
+    short = simulate(start_only)
+    assert np.array_equal(short.qpos, demo_rollout.qpos[: len(short.qpos)])
+
+
+def test_the_robot_follows_the_plan(demo_plan, demo_rollout):
+    world, planned = demo_plan.world, demo_plan.trajectory.q[:: demo_rollout.stride]
+    off = np.abs(demo_rollout.qpos[:, world.qadr] - planned[:, world.qadr])
+    assert off.max() < 0.03  # [rad]
+    base = np.linalg.norm(demo_rollout.qpos[:, :3] - planned[:, :3], axis=1)
+    assert base.max() < 0.03  # [m]
+
+
+def test_progress_goes_from_nothing_to_all(start_only):
+    seen = []
+    simulate(start_only, progress=lambda stage, share, note: seen.append(share))
+    assert seen[0] == 0.0
+    assert seen[-1] == 1.0
+    assert seen == sorted(seen)
+
+
+def test_a_plan_without_a_trajectory_cannot_be_simulated(demo_plan):
+    with pytest.raises(ValueError, match="no trajectory"):
+        simulate(replace(demo_plan, trajectory=None))
+
+
+# Forces.
+
+
+def test_contact_forces_carry_the_weight_while_it_stands(demo_plan, demo_rollout):
+    weight = 9.81 * demo_plan.world.mass
+    for rows in (slice(15, 30), slice(-100, None)):
+        total = demo_rollout.contact_force[rows].sum(axis=1).mean(axis=0)
+        assert total[2] == pytest.approx(weight, rel=0.02)
+        assert np.abs(total[:2]).max() < 0.02 * weight
+
+
+def test_over_the_whole_run_contacts_give_back_what_gravity_takes(
+    demo_plan, demo_rollout
+):
+    """Momentum: at rest before and after, the mean force is the weight."""
+    total = demo_rollout.contact_force.sum(axis=1).mean(axis=0)
+    weight = 9.81 * demo_plan.world.mass
+    assert total[2] == pytest.approx(weight, rel=0.02)
+    assert np.abs(total[:2]).max() < 0.02 * weight
+
+
+def test_surfaces_bear_load_when_the_plan_says_so(demo_plan, demo_rollout):
+    trajectory, weight = demo_plan.trajectory, 9.81 * demo_plan.world.mass
+    planned = trajectory.contact[:: demo_rollout.stride]
+    force = np.linalg.norm(demo_rollout.contact_force, axis=2)
+    assert force[~planned].max(initial=0.0) < weight  # brief touches on landing
+    open_share = (force[~planned] > 0.02 * weight).mean()
+    assert open_share < 0.02
+
+
+def test_feet_are_off_the_ground_and_knees_on_the_box_at_the_end(demo_rollout):
+    last = demo_rollout.contact_force[-1]
+    by_name = dict(zip(demo_rollout.surfaces, last, strict=True))
+    assert not by_name["LFoot"].any()
+    assert not by_name["RFoot"].any()
+    assert by_name["LKnee"][2] > 10.0
+    assert by_name["RKnee"][2] > 10.0
+
+
+def test_the_demonstration_needs_no_part_that_is_no_surface(demo_rollout):
+    assert demo_rollout.unintended_share == 0.0
+    assert not demo_rollout.unintended.any()
+    assert demo_rollout.unintended_parts == {}
+
+
+def test_the_shares_at_the_end_add_up_to_the_weight(demo_rollout):
+    assert sum(demo_rollout.end_share.values()) == pytest.approx(1.0, abs=0.01)
+    assert {k.split("@")[1] for k in demo_rollout.end_share} == {"box"}
+
+
+def test_no_motor_ever_exceeds_its_limit(demo_plan, demo_rollout):
+    order = [demo_plan.world.model.actuator(j).id for j in demo_plan.world.joints]
+    effort = np.abs(demo_rollout.actuator_force[:, order])
+    assert np.all(effort <= demo_plan.world.tau_max + 1e-9)
+    assert effort.max() > 1.0  # and they do work
+
+
+def test_a_part_that_is_no_surface_is_counted_as_unintended(demo_plan, start_only):
+    """Dropped onto its bottom: what bears the weight is none of the surfaces."""
+    t = start_only.trajectory
+    q = t.q.copy()
+    q[:, :3] = [-1.0, 0.0, 0.30]
+    sitting = turned(q[0], 1, -1.2)
+    q[:, 3:7] = sitting[3:7]
+    dropped = replace(start_only, trajectory=replace(t, q=q))
+    rollout = simulate(dropped)
+    assert rollout.unintended.max() > 100.0
+    assert rollout.unintended_share > 0.3
+    assert sum(rollout.unintended_parts.values()) == pytest.approx(
+        rollout.unintended_share
+    )
+    assert not judge(dropped, rollout).reached
+
+
+def test_deepest_self_overlap_is_what_mujoco_measures(demo_plan):
+    world, q = demo_plan.world, demo_plan.world.home.copy()
+    assert deepest_self_overlap(world, q[None]) == (0.0, "")
+    for side, sign in (("R", 1.0), ("L", -1.0)):
+        q[world.qadr[world.joints.index(f"{side}HipLat")]] = 0.35 * sign
+    depth, pair = deepest_self_overlap(world, q[None])
+    data, fromto = mujoco.MjData(world.model), np.zeros(6)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(world.model, data)
+    a, b = pair.split(" and ")
+    ids = world.model.geom(a).id, world.model.geom(b).id
+    assert depth > 0.005
+    assert depth == pytest.approx(
+        -mujoco.mj_geomDistance(world.model, data, *ids, 0.1, fromto)
+    )
+
+
+def test_physics_decides_a_box_lower_than_the_plan_believes(demo_plan):
+    world = build_world(demo_plan.world.robot, Scene.from_height(0.18))
+    believer = replace(demo_plan, world=world)
+    assert not judge(believer, simulate(believer)).reached
+
+
+# The verdict.
+
+
+def test_the_demonstration_reaches_the_top(demo_plan, demo_rollout):
+    verdict = judge(demo_plan, demo_rollout)
+    assert verdict.reached
+    assert all(c.ok for c in verdict.criteria.values())
+
+
+def test_every_criterion_names_value_and_limit(demo_plan, demo_rollout):
+    for criterion in judge(demo_plan, demo_rollout).criteria.values():
+        assert np.isfinite([criterion.value, criterion.limit]).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"end_speed": 1.01 * END_SPEED}, "pelvis speed at the end [m/s]"),
+        (
+            {"unintended_share": 1.01 * UNINTENDED_TOL},
+            "share of support on parts that are no surface",
+        ),
+        ({"overlap": 1.01 * OVERLAP_TOL}, "deepest overlap with the scene [m]"),
+        ({"self_overlap": 1.01 * OVERLAP_TOL}, "deepest overlap with itself [m]"),
+    ],
+)
+def test_each_figure_beyond_its_limit_fails_its_criterion_alone(
+    demo_plan, demo_rollout, change, name
+):
+    assert failed(demo_plan, replace(demo_rollout, **change)) == {name}
+
+
+def test_an_incomplete_plan_is_no_success(demo_plan, demo_rollout):
+    short = replace(demo_plan, complete=False)
+    assert failed(short, demo_rollout) == {"planned to the last stance"}
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_the_pelvis_may_be_a_little_lower_than_planned_but_not_much(
+    demo_plan, demo_rollout, share
+):
+    q = demo_rollout.qpos[-1].copy()
+    q[2] = demo_plan.trajectory.q[-1, 2] - share * HEIGHT_TOL
+    name = "pelvis height at the end against the plan [m]"
+    assert (name in failed(demo_plan, with_last(demo_rollout, q))) == (share > 1)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_the_pelvis_may_tilt_a_little_but_not_much(
+    demo_plan, demo_rollout, share, axis
+):
+    q = turned(demo_plan.trajectory.q[-1], axis, share * TILT_TOL)
+    names = failed(demo_plan, with_last(demo_rollout, q))
+    expected = {"pelvis tilt at the end against the plan [rad]"} if share > 1 else set()
+    assert names == expected
+
+
+def test_turning_about_the_vertical_is_no_tilt(demo_plan, demo_rollout):
+    q = turned(demo_plan.trajectory.q[-1], 2, 1.0)
+    assert failed(demo_plan, with_last(demo_rollout, q)) == set()
+
+
+def test_weight_on_other_surfaces_than_planned_is_no_success(demo_plan, demo_rollout):
+    share = dict(demo_rollout.end_share)
+    moved = 1.1 * (1 - SHARE_ON_PLAN)
+    share["LKnee@box"] -= moved
+    on_hand = replace(demo_rollout, end_share=share | {"other@box": moved})
+    assert failed(demo_plan, on_hand) == {
+        "share of the weight at the end on planned contacts"
+    }
+    on_ground = replace(demo_rollout, end_share=share | {"LFoot@ground": moved})
+    assert failed(demo_plan, on_ground) == {
+        "share of the weight at the end on planned contacts",
+        "share of the weight at the end on obstacles",
+    }
+
+
+def test_lying_on_the_top_is_not_kneeling_on_it(demo_plan, demo_rollout):
+    q = demo_rollout.qpos[-1].copy()
+    q[2] = 0.275 + 0.04
+    names = failed(demo_plan, with_last(demo_rollout, q))
+    assert "pelvis above its support at the end [m]" in names
+
+
+def test_effort_beyond_the_limit_is_no_success(demo_plan, demo_rollout):
+    force = demo_rollout.actuator_force.copy()
+    force[5, 3] = -1.01 * demo_plan.world.tau_max.max()
+    names = failed(demo_plan, replace(demo_rollout, actuator_force=force))
+    assert names == {"largest effort, share of the limit"}
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_goal_in_the_scene_is_reached_within_its_tolerance(
+    demo_plan, demo_rollout, share
+):
+    goal = demo_rollout.qpos[-1, :2] + [0.0, share * GOAL_TOL]
+    world = demo_plan.world
+    there = replace(world, scene=replace(world.scene, goal=goal))
+    names = failed(replace(demo_plan, world=there), demo_rollout)
+    assert names == ({"pelvis to the goal [m]"} if share > 1 else set())
+
+
+@pytest.mark.parametrize("share", [-1.1, -0.9, 0.9, 1.1])
+@pytest.mark.parametrize("facing", [0.0, np.pi])
+def test_a_goal_with_a_heading_wants_that_heading(
+    demo_plan, demo_rollout, share, facing
+):
+    """Also across the cut at half a turn."""
+    q = demo_plan.world.home.copy()
+    q = turned(q, 2, facing)
+    world = demo_plan.world
+    goal = np.array([*q[:2], facing + share * YAW_TOL])
+    there = replace(world, scene=replace(world.scene, goal=goal))
+    names = failed(replace(demo_plan, world=there), with_last(demo_rollout, q))
+    assert ("yaw to the goal [rad]" in names) == (abs(share) > 1)
