@@ -1,0 +1,291 @@
+"""The whole plan: complete, in the robot's scale, the same every time, or refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clamber.errors import InputError, Status
+from clamber.io import save_plan, save_rollout
+from clamber.pipeline import PlanOptions, plan
+from clamber.posture.keyframe import equilibrium_at
+from clamber.scene import Box, Scene
+from clamber.simulation import judge, simulate
+
+ROOT = Path(__file__).parents[1]
+
+
+def same(a: object, b: object) -> bool:
+    """Equal to the last bit, whatever it is made of."""
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    if hasattr(a, "__dataclass_fields__"):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    return a == b
+
+
+def at_distance(gap: float, height: float = 0.275) -> Scene:
+    box = Box(
+        name="table",
+        size=np.array([1.0, 1.2, height]),
+        position=np.array([gap + 0.5, 0.0, height / 2]),
+        rotation=np.eye(3),
+    )
+    return Scene(boxes=(box,), start=np.zeros(3))
+
+
+# The demonstration.
+
+
+def test_the_demonstration_is_planned_to_its_last_stance(demo_plan):
+    assert demo_plan.complete
+    last = {c.surface for c in demo_plan.keyframes[-1].stance}
+    assert last >= {"LElbow", "RElbow", "LKnee", "RKnee"}
+    assert {c.support for c in demo_plan.keyframes[-1].stance} == {"box"}
+    assert not {s.stance for s in demo_plan.skipped} & {
+        len(demo_plan.sequence.stances) - 1
+    }
+
+
+def test_every_keyframe_is_solved_and_held_by_forces(demo_plan, demo_kinematics):
+    for key in demo_plan.keyframes:
+        assert key.status is Status.SOLVED
+        demo_kinematics.update(key.q)
+        again = equilibrium_at(demo_kinematics, key.stance)
+        assert again.feasible
+        assert again.margin == pytest.approx(key.equilibrium.margin, abs=1e-6)
+
+
+def test_contact_optimisation_lowers_the_stability_cost(demo_plan):
+    for key in demo_plan.keyframes[1:]:
+        assert key.cost_after < key.cost_before
+        assert key.cost_after < 0.1
+
+
+def test_there_is_a_path_between_neighbouring_keyframes_and_none_else(demo_plan):
+    assert len(demo_plan.paths) == len(demo_plan.keyframes) - 1
+    assert len(demo_plan.trajectory.keyframes) == len(demo_plan.keyframes)
+
+
+def test_stances_without_a_keyframe_of_their_own_say_why(demo_plan):
+    for skipped in demo_plan.skipped:
+        assert skipped.reason
+        assert 0 < skipped.stance < len(demo_plan.sequence.stances)
+
+
+def test_the_sequence_is_brought_to_the_robots_scale(demo_plan, demo_sequence):
+    """Contacts on the robot's box, at the robot's reach, on its top."""
+    assert demo_plan.sequence.subject is None
+    assert demo_plan.sequence.scene is demo_plan.world.scene
+
+    def reach(sequence) -> float:
+        """How far behind the near edge the hands go."""
+        box = sequence.scene.boxes[0]
+        edge = box.position[0] - box.size[0] / 2
+        hands = [
+            c.position[0]
+            for stance in sequence.stances
+            for c in stance.contacts
+            if c.surface.endswith("Hand")
+        ]
+        return max(hands) - edge
+
+    person, robot = reach(demo_sequence), reach(demo_plan.sequence)
+    assert 0.4 < robot / person < 0.8  # COMAN's arms against a person's
+    for stance in demo_plan.sequence.stances:
+        for c in stance.contacts:
+            height = 0.275 if c.support == "box" else 0.0
+            assert c.position[2] == pytest.approx(height, abs=1e-9)
+
+
+def test_planning_twice_gives_the_same_bits(demo_plan, demo_sequence, coman):
+    again = plan(demo_sequence, coman, Scene.from_height(0.275))
+    for name in ("q", "v", "tau", "contact", "time", "keyframes"):
+        assert same(
+            getattr(again.trajectory, name), getattr(demo_plan.trajectory, name)
+        )
+    for a, b in zip(again.keyframes, demo_plan.keyframes, strict=True):
+        assert same(a, b)
+    assert [p.phases[1].q.tobytes() for p in again.paths] == [
+        p.phases[1].q.tobytes() for p in demo_plan.paths
+    ]
+
+
+def test_times_are_measured_by_stage_and_kept_in_one_place(demo_plan):
+    stages = {"retarget", "keyframes", "transitions", "paths", "trajectory"}
+    assert stages <= set(demo_plan.timings)
+    assert all(seconds >= 0 for seconds in demo_plan.timings.values())
+    for record in (*demo_plan.keyframes, *demo_plan.paths, demo_plan.trajectory):
+        assert not {"timings", "seconds"} & {f.name for f in fields(record)}
+
+
+def test_progress_is_reported_stage_by_stage(demo_sequence, coman):
+    seen = []
+    scene = Scene.from_height(0.275)
+    short = replace(
+        demo_sequence, stances=demo_sequence.stances[:2], t=demo_sequence.t[:3]
+    )
+    result = plan(short, coman, scene, progress=lambda *report: seen.append(report))
+    assert result.complete
+    assert [stage for stage, _, _ in seen] == ["plan", "trajectory"]
+    assert all(0.0 <= share <= 1.0 for _, share, _ in seen)
+    assert "LHand on box" in seen[0][2]
+
+
+# What cannot be planned.
+
+
+@pytest.mark.parametrize("speed", [0.0, -0.3, float("nan")])
+def test_a_speed_that_is_not_positive_is_refused(demo_sequence, coman, speed):
+    with pytest.raises(InputError, match=r"speed .* expected a positive joint speed"):
+        plan(
+            demo_sequence,
+            coman,
+            Scene.from_height(0.275),
+            options=PlanOptions(speed=speed),
+        )
+
+
+@pytest.mark.parametrize("scene", [at_distance(3.0), at_distance(0.23, height=3.0)])
+def test_a_box_out_of_reach_is_refused_by_name(demo_sequence, coman, scene):
+    with pytest.raises(InputError) as error:
+        plan(demo_sequence, coman, scene)
+    assert error.value.field == "scene.boxes.table"
+    assert "robot's reach" in str(error.value)
+
+
+def test_a_scene_without_the_box_is_refused(demo_sequence, coman):
+    with pytest.raises(InputError) as error:
+        plan(demo_sequence, coman, Scene(start=np.zeros(3)))
+    assert error.value.field == "scene.boxes"
+
+
+def test_a_box_that_is_near_but_too_high_is_an_incomplete_plan(demo_sequence, coman):
+    result = plan(demo_sequence, coman, Scene.from_height(0.75))
+    assert not result.complete
+    missed = [s for s in result.skipped if "on box: " in s.reason]
+    assert missed
+    reasons = {status.value for status in Status} - {Status.SOLVED.value}
+    assert all(
+        any(r in s.reason for r in reasons)
+        or "opens" in s.reason
+        or "overlap" in s.reason
+        for s in missed
+    )
+
+
+# Whole climbs in physics, and the judge that lies beside the repository.
+
+
+@pytest.fixture(scope="module")
+def ask_judge():
+    """`ask_judge(folder, height)`: the independent judge's verdict on a run folder."""
+    script = ROOT.parent / "shared" / "judge" / "judge.py"
+
+    def ask(folder: Path, height: float) -> dict:
+        if not script.is_file():
+            pytest.skip("no judge beside the repository")
+        command = [sys.executable, str(script), str(folder), "--goal", "top"]
+        command += ["--height", str(height), "--min-mass", "28", "--max-effort", "50"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode in (0, 1), done.stderr
+        return json.loads(done.stdout)
+
+    return ask
+
+
+def refused(verdict: dict) -> dict:
+    return {n: c["value"] for n, c in verdict["criteria"].items() if not c["ok"]}
+
+
+def climb(sequence, robot, height, folder, **options):
+    """Plan and simulate into a run folder."""
+    result = plan(
+        sequence, robot, Scene.from_height(height), options=PlanOptions(**options)
+    )
+    assert result.complete, [s.reason for s in result.skipped]
+    rollout = simulate(result)
+    save_plan(result, folder)
+    save_rollout(rollout, folder)
+    return result, rollout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height", [0.20, 0.25, 0.275, 0.31, 0.36, 0.42])
+def test_the_robot_climbs_boxes_of_many_heights(
+    demo_sequence, coman, height, tmp_path, ask_judge
+):
+    result, rollout = climb(demo_sequence, coman, height, tmp_path)
+    verdict = judge(result, rollout)
+    assert verdict.reached, {n: c for n, c in verdict.criteria.items() if not c.ok}
+    assert refused(ask_judge(tmp_path, height)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["lbfgs", "gradient"])
+def test_the_other_methods_climb_too(demo_sequence, coman, method, tmp_path, ask_judge):
+    result, rollout = climb(demo_sequence, coman, 0.275, tmp_path, method=method)
+    assert {k.method for k in result.keyframes[1:]} == {method}
+    assert judge(result, rollout).reached
+    assert refused(ask_judge(tmp_path, 0.275)) == {}
+
+
+@pytest.mark.slow
+def test_as_slowly_as_in_the_experiments(demo_sequence, coman, tmp_path, ask_judge):
+    result, rollout = climb(demo_sequence, coman, 0.275, tmp_path, speed=0.05)
+    assert np.abs(result.trajectory.v[:, 6:]).max() <= 0.05 * 1.005
+    assert judge(result, rollout).reached
+    assert refused(ask_judge(tmp_path, 0.275)) == {}
+
+
+@pytest.mark.slow
+def test_a_real_recording_is_climbed(coman, shared, tmp_path, ask_judge):
+    from clamber.demo import load_demo
+    from clamber.detect import detect_contacts
+
+    if not (shared / "demos" / "climb-0" / "joints.npy").is_file():
+        pytest.skip("no recording climb-0 beside the repository")
+    recording = load_demo(str(ROOT / "examples" / "recordings" / "climb-0.yaml"))
+    result, rollout = climb(detect_contacts(recording), coman, 0.262, tmp_path)
+    assert judge(result, rollout).reached
+    assert refused(ask_judge(tmp_path, 0.262)) == {}
+
+
+@pytest.mark.slow
+def test_the_judge_refuses_runs_that_were_tampered_with(
+    demo_plan, demo_rollout, tmp_path, ask_judge, rng
+):
+    """Else its consent would mean nothing."""
+    save_plan(demo_plan, tmp_path)
+
+    def verdict(**changes) -> dict:
+        save_rollout(replace(demo_rollout, **changes), tmp_path)
+        return refused(ask_judge(tmp_path, 0.275))
+
+    assert verdict() == {}
+    noise = rng.normal(0.0, 0.05, demo_rollout.ctrl.shape)
+    replay = "replay difference [m, rad]"
+    assert replay in verdict(ctrl=demo_rollout.ctrl + noise)
+    lifted = demo_rollout.qpos.copy()
+    lifted[len(lifted) // 2 :, 2] += 0.002
+    assert replay in verdict(qpos=lifted)
+    n = len(demo_rollout.qpos) // 2
+    half = {k: getattr(demo_rollout, k)[:n] for k in ("time", "qpos", "qvel")}
+    names = verdict(ctrl=demo_rollout.ctrl[: n * demo_rollout.stride], **half)
+    assert "share of the weight on obstacles at the end" in names
+    save_rollout(demo_rollout, tmp_path)
+    assert "the boxes are those asked for" in refused(ask_judge(tmp_path, 0.31))
+    light = (tmp_path / "scene.xml").read_text().replace("-9.81", "-8.81")
+    copy = tmp_path / "light"
+    shutil.copytree(tmp_path, copy, ignore=shutil.ignore_patterns("light"))
+    (copy / "scene.xml").write_text(light)
+    assert "gravity is on, step is 1 ms" in refused(ask_judge(copy, 0.275))
