@@ -1,0 +1,76 @@
+"""How much faster than real time physics runs, controller and recording included.
+
+    python benchmarks/bench_simulation.py
+
+Simulates the built-in climb a few times, and steps the recorded commands in plain
+MuJoCo for comparison: the difference is what controller and measurements cost.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import time
+
+import mujoco
+import numpy as np
+
+from clamber.demo import load_demo
+from clamber.detect import detect_contacts
+from clamber.model import PHYSICS_STEP, load_robot
+from clamber.pipeline import plan
+from clamber.scene import Scene
+from clamber.simulation import judge, simulate
+
+HEIGHT = 0.275  # [m]
+REPEATS = 3
+
+
+def peak_memory() -> float:
+    """Of this process so far [MB]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def replay(xml: str, start: np.ndarray, ctrl: np.ndarray) -> float:
+    """Seconds that plain MuJoCo takes for the recorded commands."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    began = time.perf_counter()
+    for u in ctrl:
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+    return time.perf_counter() - began
+
+
+def main() -> None:
+    sequence, robot = detect_contacts(load_demo("climb")), load_robot("coman")
+    result = plan(sequence, robot, Scene.from_height(HEIGHT))
+    before = peak_memory()
+    ours, plain, judging = [], [], []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        rollout = simulate(result)
+        ours.append(time.perf_counter() - start)
+        start = time.perf_counter()
+        verdict = judge(result, rollout)
+        judging.append(time.perf_counter() - start)
+        plain.append(replay(result.world.xml, rollout.qpos[0], rollout.ctrl))
+    seconds = len(rollout.ctrl) * PHYSICS_STEP
+    print(
+        f"climb onto {HEIGHT} m, {seconds:.0f} s of motion at 1 kHz,"
+        f" {'reached' if verdict.reached else 'NOT REACHED'}; median of {REPEATS}"
+    )
+    print(f"{'':14}{'[s]':>8}{'x real time':>14}{'us a step':>12}")
+    for name, took in (("simulate", ours), ("plain MuJoCo", plain)):
+        t = statistics.median(took)
+        per_step = 1e6 * t / len(rollout.ctrl)
+        print(f"{name:14}{t:8.2f}{seconds / t:14.1f}{per_step:12.1f}")
+    print(f"{'judge':14}{statistics.median(judging):8.4f}")
+    print(f"peak memory {peak_memory():.0f} MB, {before:.0f} MB of it before physics")
+
+
+if __name__ == "__main__":
+    main()
