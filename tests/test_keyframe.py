@@ -1,4 +1,4 @@
-"""Postures with a new contact: the cost, three ways to lower it, the measured result."""
+"""Postures with a new contact: their cost, three ways to lower it, what is measured."""
 
 import math
 from dataclasses import replace
