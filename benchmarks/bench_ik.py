@@ -1,0 +1,295 @@
+"""Time of one inverse-kinematics iteration, here and in mink and Pink.
+
+    python benchmarks/bench_ik.py
+
+COMAN stands on both feet (two 6D equality constraints) while its hands go to two points
+(two 3D tasks) and its centre of mass to the middle of its feet, close to a posture,
+within joint and step limits. From the same postures, each library takes one full step:
+kinematics, rows, QP (DAQP in all three) and integration. Ours also has rows that would
+keep the centre of mass inside the support polygon; they are slack here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from clamber.model import World, build_world, load_robot
+from clamber.posture.ik import (
+    IK,
+    STEP_ROTATION,
+    STEP_TRANSLATION,
+    ContactGoal,
+    PostureProblem,
+    base_clearance,
+    contact_clearance,
+)
+from clamber.scene import Scene
+
+POSTURES = 300
+REPEATS = 20  # iterations from home, to see that all three solve the same problem
+HANDS = {"LHand": np.array([0.38, 0.20, 0.33]), "RHand": np.array([0.38, -0.20, 0.33])}
+FEET = ("LFoot", "RFoot")
+HAND, COM, POSTURE = 2.0, 0.3, 0.08  # weights
+MARGIN = 0.01  # [m] between links, and between links and the scene
+RANGE = 0.10  # [m] nearer pairs have a row, in all that have them
+
+Step = Callable[[np.ndarray], np.ndarray]
+
+
+def feet_middle(world: World) -> np.ndarray:
+    """(3,) the middle of the soles, at the height of the centre of mass at home."""
+    ik = IK(world)
+    ik.kin.update(world.home)
+    up = np.array([0.0, 0.0, 1.0])
+    corners = np.concatenate([ik.kin.bearing_points(f, up) for f in FEET])
+    return np.array([*corners[:, :2].mean(axis=0), ik.kin.com[2]])
+
+
+def clamber_step(world: World, *, collisions: bool) -> Step:
+    ik = IK(world)
+    ik.kin.update(world.home)
+    goals = []
+    up = np.array([0.0, 0.0, 1.0])
+    for f in FEET:
+        p = ik.kin.contact_point(f, up)
+        goals.append(
+            ContactGoal(surface=f, support="ground", position=p, rotation=np.eye(3))
+        )
+    for hand, p in HANDS.items():
+        # A surface's goal is where it would touch: a ball's lowest point.
+        low = p - up * world.surfaces[hand].radius
+        goals.append(
+            ContactGoal(
+                surface=hand,
+                support="ground",
+                position=low,
+                rotation=np.eye(3),
+                hard=False,
+                reference=HAND,
+            )
+        )
+    clearance = np.full(len(world.pairs), -np.inf)
+    if collisions:
+        where = dict.fromkeys(FEET, "ground")
+        clearance = contact_clearance(world, base_clearance(world, MARGIN), where)
+    problem = PostureProblem(
+        goals=tuple(goals),
+        q_reference=world.home,
+        clearance=clearance,
+        balance_margin=-0.2,  # never active: the others have no such rows
+        com_weight=COM,
+        posture_weight=POSTURE,
+        base_weight=0.0,
+    )
+
+    def step(q: np.ndarray) -> np.ndarray:
+        return ik.kin.integrate(q, ik.step(ik.build(problem, q)))
+
+    return step
+
+
+def mink_step(world: World, *, collisions: bool) -> Step:
+    import mink
+
+    m = world.model
+    configuration = mink.Configuration(m, world.home)
+    feet = []
+    for f in FEET:
+        task = mink.FrameTask(f, "body", position_cost=1.0, orientation_cost=1.0)
+        task.set_target_from_configuration(configuration)
+        feet.append(task)
+    tasks: list = []
+    for hand, p in HANDS.items():
+        task = mink.FrameTask(hand, "geom", position_cost=HAND, orientation_cost=0.0)
+        task.set_target(mink.SE3.from_translation(p))
+        tasks.append(task)
+    com = mink.ComTask(cost=[COM, COM, 0.0])
+    com.set_target(feet_middle(world))
+    posture = mink.PostureTask(m, cost=[0.0] * 6 + [POSTURE] * len(world.joints))
+    posture.set_target(world.home)
+    tasks += [com, posture]
+    limits: list = [
+        mink.ConfigurationLimit(m, gain=1.0),
+        mink.VelocityLimit(m, dict.fromkeys(world.joints, STEP_ROTATION)),
+    ]
+    if collisions:
+        feet_on_ground = {frozenset((f, "ground")) for f in FEET}
+        pairs = [
+            ([m.geom(a).name], [m.geom(b).name])
+            for a, b in world.pairs.tolist()
+            if frozenset((m.geom(a).name, m.geom(b).name)) not in feet_on_ground
+        ]
+        limits.append(
+            mink.CollisionAvoidanceLimit(
+                m,
+                pairs,
+                gain=1.0,
+                minimum_distance_from_collisions=MARGIN,
+                collision_detection_distance=RANGE,
+            )
+        )
+
+    def step(q: np.ndarray) -> np.ndarray:
+        configuration.update(q)
+        try:
+            v = mink.solve_ik(
+                configuration,
+                tasks,
+                1.0,
+                solver="daqp",
+                damping=2e-4,
+                limits=limits,
+                constraints=feet,
+            )
+        except mink.exceptions.NoSolutionFound:
+            return q
+        return configuration.integrate(v, 1.0)
+
+    return step
+
+
+def pink_step(world: World) -> Step:
+    import pink
+    import pinocchio as pin
+    from pink.limits import ConfigurationLimit, VelocityLimit
+
+    model = pin.buildModelFromMJCF(str(world.robot.path))
+    base = slice(0, 7)
+    model.lowerPositionLimit[base], model.upperPositionLimit[base] = -np.inf, np.inf
+    speed = np.full(model.nv, STEP_ROTATION)
+    speed[:3] = STEP_TRANSLATION
+    model.velocityLimit = speed
+    for hand in HANDS:
+        s = world.surfaces[hand]
+        link = model.frames[model.getFrameId(world.model.body(s.body).name, pin.BODY)]
+        at = link.placement * pin.SE3(np.eye(3), s.centre)
+        frame = pin.Frame(hand, link.parentJoint, 0, at, pin.FrameType.OP_FRAME)
+        model.addFrame(frame)
+    order = [model.joints[model.getJointId(j)].idx_q for j in world.joints]
+
+    def to_pin(q: np.ndarray) -> np.ndarray:
+        out = pin.neutral(model)
+        out[:3], out[3:6], out[6] = q[:3], q[4:7], q[3]  # pinocchio: xyzw
+        out[order] = q[world.qadr]
+        return out
+
+    def from_pin(x: np.ndarray) -> np.ndarray:
+        out = np.empty(len(x))
+        out[:3], out[4:7], out[3] = x[:3], x[3:6], x[6]
+        out[world.qadr] = x[order]
+        return out
+
+    configuration = pink.Configuration(model, model.createData(), to_pin(world.home))
+    feet = []
+    for f in FEET:
+        task = pink.FrameTask(f, position_cost=1.0, orientation_cost=1.0)
+        task.set_target_from_configuration(configuration)
+        feet.append(task)
+    tasks: list = []
+    for hand, p in HANDS.items():
+        task = pink.FrameTask(hand, position_cost=HAND, orientation_cost=0.0)
+        task.set_target(pin.SE3(np.eye(3), p))
+        tasks.append(task)
+    com = pink.tasks.ComTask(cost=[COM, COM, 0.0])
+    com.set_target(feet_middle(world))
+    posture = pink.PostureTask(cost=POSTURE)
+    posture.set_target(to_pin(world.home))
+    tasks += [com, posture]
+    limits = [ConfigurationLimit(model, config_limit_gain=1.0), VelocityLimit(model)]
+
+    def step(q: np.ndarray) -> np.ndarray:
+        configuration.update(to_pin(q))
+        v = pink.solve_ik(
+            configuration,
+            tasks,
+            1.0,
+            solver="daqp",
+            damping=2e-4,
+            limits=limits,
+            constraints=feet,
+            safety_break=False,
+        )
+        return from_pin(configuration.integrate(v, 1.0))
+
+    return step
+
+
+def postures(world: World, rng: np.random.Generator) -> list[np.ndarray]:
+    """Around home, within the limits."""
+    out = []
+    for _ in range(POSTURES):
+        q = world.home.copy()
+        q[:3] += rng.uniform(-0.02, 0.02, 3)
+        q[world.qadr] += rng.uniform(-0.1, 0.1, len(world.qadr))
+        q[world.qadr] = q[world.qadr].clip(
+            world.q_min[world.dadr] + 1e-3, world.q_max[world.dadr] - 1e-3
+        )
+        out.append(q)
+    return out
+
+
+def median_us(step: Step, inputs: list[np.ndarray]) -> tuple[float, int]:
+    """Median time of a step, and from how many postures there was none."""
+    took, failed = [], 0
+    for q in inputs:
+        start = time.perf_counter()
+        after = step(q)
+        took.append(time.perf_counter() - start)
+        failed += np.array_equal(after, q)
+    return 1e6 * float(np.median(took)), failed
+
+
+def open_by(world: World, step: Step) -> tuple[float, float]:
+    """Error of the hands and drift of the feet after some iterations from home [mm]."""
+    data = mujoco.MjData(world.model)
+    data.qpos[:] = q = world.home
+    mujoco.mj_kinematics(world.model, data)
+    before = {f: data.body(f).xpos.copy() for f in FEET}
+    for _ in range(REPEATS):
+        q = step(q)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(world.model, data)
+    hands = max(np.linalg.norm(data.geom(h).xpos - p) for h, p in HANDS.items())
+    feet = max(np.linalg.norm(data.body(f).xpos - p) for f, p in before.items())
+    return 1e3 * float(hands), 1e3 * float(feet)
+
+
+def main() -> None:
+    world = build_world(load_robot("coman"), Scene.from_height(0.275))
+    inputs = postures(world, np.random.default_rng(0))
+    rows: list[tuple[str, Callable[[], Step] | None]] = [
+        ("clamber", lambda: clamber_step(world, collisions=False)),
+        ("mink", lambda: mink_step(world, collisions=False)),
+        ("Pink", lambda: pink_step(world)),
+        (
+            f"clamber, {len(world.pairs)} pairs",
+            lambda: clamber_step(world, collisions=True),
+        ),
+        (f"mink, {len(world.pairs)} pairs", lambda: mink_step(world, collisions=True)),
+    ]
+    print(f"{POSTURES} postures; after {REPEATS} iterations from home: hands, feet")
+    print(f"{'':22}{'median':>10}{'ratio':>8}{'hands':>11}{'feet':>11}")
+    ours = 0.0
+    for name, make in rows:
+        try:
+            step = make()
+        except ImportError:
+            print(f"{name:22}   not installed: pip install 'clamber[compare]'")
+            continue
+        median_us(step, inputs[:20])
+        us, failed = median_us(step, inputs)
+        ours = us if name.startswith("clamber") else ours
+        hands, feet = open_by(world, step)
+        print(
+            f"{name:22}{us:7.0f} us{us / ours:7.1f}x{hands:8.2f} mm{feet:8.3f} mm",
+            end="",
+        )
+        print(f"   {failed} without a step" if failed else "")
+
+
+if __name__ == "__main__":
+    main()
