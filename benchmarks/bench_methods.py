@@ -1,0 +1,66 @@
+"""The three ways to optimise contacts, on the built-in demonstration of a climb.
+
+    python benchmarks/bench_methods.py [HEIGHT]
+
+The contacts of the demonstration are detected once; then the whole climb onto a box of
+that height [m] (0.275 by default) is planned with each method: time of planning,
+iterations of each keyframe (of the contacts; QPs with `direct`, which has no outer
+loop), and the stability cost of its new contact, sum of w || X - S ||^2, at the
+demonstrated position and at the one found.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import get_args
+
+import numpy as np
+
+from clamber.demo import load_demo
+from clamber.detect import detect_contacts
+from clamber.model import load_robot
+from clamber.pipeline import Method, Plan, PlanOptions, plan
+from clamber.scene import Scene
+
+
+def table(result: Plan) -> None:
+    print(f"  {'keyframe':34}{'iterations':>11}{'before':>9}{'after':>9}  status")
+    for key, path in zip(result.keyframes[1:], result.paths, strict=True):
+        print(
+            f"  {path.transition.move!s:34}{key.iterations:11d}"
+            f"{key.cost_before:9.4f}{key.cost_after:9.4f}  {key.status.name.lower()}"
+        )
+    for s in result.skipped:
+        if s.missed:
+            print(f"  missed: {s.reason}")
+
+
+def main() -> None:
+    height = float(sys.argv[1]) if len(sys.argv) > 1 else 0.275
+    robot, scene = load_robot("coman"), Scene.from_height(height)
+    sequence = detect_contacts(load_demo("climb"))
+    print(f"built-in climb, {robot.name}, a box of {height:g} m")
+    rows = []
+    for method in get_args(Method):
+        start = time.perf_counter()
+        result = plan(sequence, robot, scene, options=PlanOptions(method=method))
+        total = time.perf_counter() - start
+        keys = result.keyframes[1:]
+        print(f"\n{method}")
+        table(result)
+        costs = np.array([(k.cost_before, k.cost_after) for k in keys]).reshape(-1, 2)
+        share = result.timings.get("keyframes", 0.0)
+        iterations = sum(k.iterations for k in keys)
+        rows.append((method, total, share, len(keys), iterations, *costs.sum(axis=0)))
+    print(f"\n{'method':10}{'total':>9}{'postures':>10}{'made':>6}", end="")
+    print(f"{'iterations':>12}{'before':>9}{'after':>9}")
+    for method, total, share, made, iterations, before, after in rows:
+        print(
+            f"{method:10}{total:7.1f} s{share:8.1f} s{made:6d}{iterations:12d}"
+            f"{before:9.3f}{after:9.3f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
