@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -284,8 +283,8 @@ def test_the_judge_refuses_runs_that_were_tampered_with(
     assert "share of the weight on obstacles at the end" in names
     save_rollout(demo_rollout, tmp_path)
     assert "the boxes are those asked for" in refused(ask_judge(tmp_path, 0.31))
-    light = (tmp_path / "scene.xml").read_text().replace("-9.81", "-8.81")
-    copy = tmp_path / "light"
-    shutil.copytree(tmp_path, copy, ignore=shutil.ignore_patterns("light"))
-    (copy / "scene.xml").write_text(light)
-    assert "gravity is on, step is 1 ms" in refused(ask_judge(copy, 0.275))
+    scene = tmp_path / "scene.xml"
+    light = scene.read_text().replace("<option ", '<option gravity="0 0 -8.81" ', 1)
+    scene.write_text(light)
+    names = refused(ask_judge(tmp_path, 0.275))
+    assert {"gravity is on, step is 1 ms", replay} <= names.keys()
