@@ -211,6 +211,7 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
             q_reference=reference,
             extra=(goal,),
             posture_weight=0.3,
+            margin=t.margin if made else BRIDGE_MARGIN,
         )
         if not adapt:
             nothing = np.full(len(world.pairs), -np.inf)

@@ -27,6 +27,7 @@ from clamber.posture.keyframe import (
 from clamber.scene import GROUND
 from clamber.se3 import quat_from_matrix
 from clamber.transition import (
+    MARGINS,
     approach_contact,
     eased_contact,
     plan_transition,
@@ -195,27 +196,40 @@ def plan_step(
     else:
         key = METHODS[method](ik, task, before.q, options)
     lap("keyframes")
-    transition = plan_transition(ik, before, key, move)
-    solved = key.status is transition.status is Status.SOLVED
-    if move.makes and not solved:
+    result = _best_margin(ik, before, key, move, lap)
+    if isinstance(result, str) and move.makes:
         # Put the contact where the unloaded robot reaches it, and optimise around that.
         wanted = next(c for c in key.stance if c.surface == move.makes.surface)
-        there = _keyframe_there(ik, task, wanted, transition.shifted, method, options)
+        there = _keyframe_there(ik, task, wanted, before.q, method, options)
         key = replace(
             there,
             cost_before=key.cost_before,
             iterations=key.iterations + there.iterations,
         )
-        transition = plan_transition(ik, before, key, move)
-    lap("transitions")
-    for status in (key.status, transition.status):
-        if status is not Status.SOLVED:
-            return f"{move}: {status.value}"
-    path = plan_path(ik, transition)
-    lap("paths")
-    if path.status is not Status.SOLVED:
-        return f"{move}: {path.note or path.status.value}"
-    return key, path
+        lap("keyframes")
+        result = _best_margin(ik, before, key, move, lap)
+    return result if isinstance(result, str) else (key, result)
+
+
+def _best_margin(
+    ik: IK, before: Keyframe, key: Keyframe, move: Move, lap: Callable[[str], None]
+) -> Path | str:
+    """The path with the largest of `MARGINS` for which there is one, or why not."""
+    if key.status is not Status.SOLVED:
+        return f"{move}: {key.status.value}"
+    reason = ""
+    for margin in MARGINS:
+        transition = plan_transition(ik, before, key, move, margin=margin)
+        lap("transitions")
+        if transition.status is not Status.SOLVED:
+            reason = f"{move}: {transition.status.value}"
+            continue
+        path = plan_path(ik, transition)
+        lap("paths")
+        if path.status is Status.SOLVED:
+            return path
+        reason = f"{move}: {path.note or path.status.value}"
+    return reason
 
 
 def _keyframe_there(

@@ -30,11 +30,11 @@ from clamber.posture.ik import (
 from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
 
 REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
-BALANCE_MARGIN = 0.025  # [m] of the centre of mass while a contact moves
+MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
+# that can be kept
 ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
 LEAN_WEIGHT = 0.5  # soft task (4.27)
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
-REACH_TOL = 0.02  # [m] a contact farther off than this is somewhere else
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -48,6 +48,7 @@ class Transition:
         touching: (nq,) the new contact closed, not loaded.
         held: Contacts that stay.
         leaving: Contacts that are broken, as they were; `rolling` as they are let go.
+        margin: Of the centre of mass to the border of its polygon, throughout [m].
         status: Of the worst of its postures, with its residuals.
     """
 
@@ -59,6 +60,7 @@ class Transition:
     held: tuple[Contact, ...]
     leaving: tuple[Contact, ...]
     rolling: tuple[Contact, ...]
+    margin: float
     iterations: int
     status: Status
     residuals: Residuals
@@ -119,8 +121,20 @@ def balance_problem(
     extra: tuple[ContactGoal, ...] = (),
     posture_weight: float = 0.08,
     touching: Mapping[str, str] | None = None,
+    margin: float = MARGINS[-1],
 ) -> PostureProblem:
-    """Balance on `held`, with `closed` in contact but not loaded."""
+    """Balance on `held`, with `closed` in contact but not loaded.
+
+    Args:
+        world: Robot and scene.
+        held: Contacts that bear load.
+        closed: Contacts that do not.
+        q_reference: (nq,) preferred posture.
+        extra: Further goals.
+        posture_weight: Of the preferred posture.
+        touching: Support by surface, of what may touch besides.
+        margin: Of the centre of mass to the border of its polygon [m].
+    """
     where = {c.surface: c.support for c in (*held, *closed)} | dict(touching or {})
     rolling = [c.surface for c in (*held, *closed) if c.edge is not None]
     return PostureProblem(
@@ -133,7 +147,7 @@ def balance_problem(
         clearance=contact_clearance(
             world, base_clearance(world, CLEARANCE), where, rolling
         ),
-        balance_margin=BALANCE_MARGIN,
+        balance_margin=margin,
         posture_weight=posture_weight,
         ellipse_weight=ELLIPSE_WEIGHT,
         com_weight=0.3,
@@ -142,12 +156,16 @@ def balance_problem(
 
 
 def plan_transition(
-    ik: IK, before: Keyframe, after: Keyframe, move: Move
+    ik: IK, before: Keyframe, after: Keyframe, move: Move, *, margin: float
 ) -> Transition:
     """Shift, touch and settle between two keyframes.
 
-    The new contact may still give way by `REACH_TOL` where the unloaded robot cannot
-    reach the loaded one's position; the caller then optimises the keyframe again.
+    Args:
+        ik: Workspace.
+        before: Keyframe it starts from.
+        after: Keyframe it leads to.
+        move: What changes between them.
+        margin: Of the centre of mass to the border of its polygon [m].
     """
     world = ik.world
     held = tuple(c for c in before.stance if c.surface not in move.breaks)
@@ -155,18 +173,19 @@ def plan_transition(
     middle = np.mean([c.position for c in held], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
     shift = ik.solve_hard(
-        balance_problem(world, held=held, closed=rolling, q_reference=before.q),
+        balance_problem(
+            world, held=held, closed=rolling, q_reference=before.q, margin=margin
+        ),
         before.q,
     )
-    solutions = [shift]
-    if move.makes is None:
-        touching = after.q
-    else:
+    solutions, touching = [shift], after.q
+    if move.makes is not None:
         made = next(c for c in after.stance if c.surface == move.makes.surface)
-        touch = _touch(ik, held, made, shift.q, after.q)
-        solutions.append(touch)
-        touching = touch.q
         move = replace(move, makes=made)
+        if shift.status is Status.SOLVED:
+            touch = _touch(ik, held, made, shift.q, after.q, margin)
+            solutions.append(touch)
+            touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
     return Transition(
         move=move,
@@ -177,6 +196,7 @@ def plan_transition(
         held=held,
         leaving=leaving,
         rolling=rolling,
+        margin=margin,
         iterations=sum(s.iterations for s in solutions),
         status=worst.status,
         residuals=worst.residuals,
@@ -189,6 +209,7 @@ def _touch(
     made: Contact,
     shifted: np.ndarray,
     after: np.ndarray,
+    margin: float,
 ) -> Solution:
     """Close the new contact from the loaded posture, the weight still on the rest."""
     world, kin = ik.world, ik.kin
@@ -201,6 +222,7 @@ def _touch(
         held=held,
         closed=(made,),
         q_reference=0.5 * (shifted + after),
+        margin=margin,
     )
     problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
     return ik.solve_hard(problem, after)
