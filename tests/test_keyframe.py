@@ -12,6 +12,7 @@ from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import World, build_world, load_robot
 from clamber.posture import direct, gradient, lbfgs
+from clamber.posture.alternating import Alternation
 from clamber.posture.ik import EDGE_INSET, IK, ContactGoal
 from clamber.posture.keyframe import (
     Keyframe,
@@ -243,28 +244,53 @@ def test_new_contacts_stay_inside_their_support(ik, name, surface, x, y):
     assert p[2] == pytest.approx(0.275, abs=5e-4)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_a_yawed_and_tilted_box_is_climbed_alike(name):
-    R = matrix_from_rpy([0.06, -0.05, 0.5])
+@pytest.fixture(scope="module")
+def askew() -> tuple[IK, KeyframeTask]:
+    """The left hand on a box that is yawed and slightly tilted."""
     box = Box(
         name="box",
         size=np.array([1.0, 1.2, 0.25]),
         position=np.array([0.85, 0.0, 0.14]),
-        rotation=R,
+        rotation=matrix_from_rpy([0.06, -0.05, 0.5]),
     )
-    tilted = IK(
-        build_world(load_robot("coman"), Scene(boxes=(box,), start=np.zeros(3)))
-    )
-    top = tilted.world.supports["box"]
+    ik = IK(build_world(load_robot("coman"), Scene(boxes=(box,), start=np.zeros(3))))
+    top = ik.world.supports["box"]
     p = np.array([0.42, 0.15, 0.0])
     p[2] = (top.normal @ top.position - top.normal[:2] @ p[:2]) / top.normal[2]
-    task = task_of(tilted, on_box("LHand", *p))
-    k = METHODS[name].optimise(tilted, task, tilted.world.home, KeyframeOptions())
+    return ik, task_of(ik, on_box("LHand", *p))
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_yawed_and_tilted_box_is_climbed_alike(askew, name):
+    ik, task = askew
+    top = ik.world.supports["box"]
+    k = METHODS[name].optimise(ik, task, ik.world.home, KeyframeOptions())
     assert k.status is Status.SOLVED
     assert k.cost_after < 0.2 * k.cost_before
     found = k.contacts[-1].contact.position
     assert top.height(found) == pytest.approx(0.0, abs=5e-4)
     assert top.inside(found, EDGE_INSET - 1e-4)
+
+
+def test_outer_methods_see_the_gradient_in_the_supports_own_plane(
+    askew, finite_difference
+):
+    ik, task = askew
+    top = ik.world.supports["box"]
+    outer = Alternation(ik, task, ik.world.home, KeyframeOptions())
+    x = outer.start()
+    np.testing.assert_allclose(outer.positions(x)[0], task.new[0].position, atol=1e-9)
+    _, grad = outer.evaluate(x)
+    q = ik.kin.q
+    mass = located(ik.world, q).body("LShr").xpos
+    reached = top.rotation.T @ (new_positions(ik.kin, task)[0] - top.position)
+
+    def cost(local: np.ndarray) -> float:
+        e = (top.position + top.rotation[:, :2] @ local - mass)[:2]
+        return 5.0 * float(e @ e)
+
+    numeric = finite_difference(cost, reached[:2])
+    np.testing.assert_allclose(grad.ravel(), numeric, atol=1e-4)
 
 
 def test_more_weight_on_stability_brings_the_contact_closer_to_its_mass(ik):
