@@ -31,6 +31,7 @@ from clamber.se3 import (
     quat_from_matrix,
     rotation_vector,
 )
+from clamber.statics import support_ellipse, support_polygon
 
 UP = np.array([0.0, 0.0, 1.0])
 BALLS = ("LHand", "RElbow", "LKnee")
@@ -366,6 +367,75 @@ def test_the_quadratic_term_is_the_curvature_where_the_task_is_met(ik, task, rng
         expected = v @ (qp.H - DAMPING * np.eye(w.model.nv)) @ v
         assert expected == pytest.approx(curvature, rel=2e-3)
         assert curvature > 0
+
+
+def test_the_reference_of_a_free_contact_acts_within_its_plane(ik):
+    """Off the support by any height, only the shift along it is drawn back."""
+    w = ik.world
+    q = posture_for(ik, "reference of a free contact")
+    support = w.supports["tilted"]
+    n = support.normal
+    goal = goal_at(ik, q, "LKnee", "tilted", free=True, reference=2.0)
+    above = replace(goal, position=goal.position + 0.3 * n)
+    qp = ik.build(problem_of(w, above), q)
+    np.testing.assert_allclose(qp.c, 0.0, atol=1e-9)
+    beside = replace(goal, position=goal.position + 0.1 * support.rotation[:, 1])
+    qp = ik.build(problem_of(w, beside), q)
+    expected = -4.0 * 0.1 * support.rotation[:, 1]  # towards it: the base's own motion
+    np.testing.assert_allclose(qp.c[:3], expected, atol=1e-9)
+
+
+def test_a_surface_on_its_edge_would_rather_lie_flat(ik):
+    """About its own edge it may turn, softly drawn back: 1/2 (0.3 turn)^2."""
+    w, q = ik.world, ik.world.home
+    goal = goal_at(ik, q, "LFoot", "ground", edge=1)
+    s = w.surface("LFoot", 1)
+    ik.kin.update(q)
+    axis = ik.kin.rotation(s.body) @ (s.corners[1] - s.corners[0])
+    axis /= np.linalg.norm(axis)
+    turned = Rotation.from_rotvec(0.2 * axis).as_matrix() @ goal.rotation
+    problem = problem_of(w, replace(goal, rotation=turned))
+    qp = ik.build(problem, q)
+    _, e = hard_rows(qp, w.model.nv)
+    np.testing.assert_allclose(e, 0.0, atol=1e-7)  # the turn is no violation
+    assert qp.merit == pytest.approx(0.5 * (0.3 * 0.2) ** 2)
+    _, rot = ik.kin.jacobians(s.body, goal.position)
+    np.testing.assert_allclose(qp.c, 0.09 * -0.2 * axis @ rot, atol=1e-9)
+    assert ik.residuals(problem, q).contact == pytest.approx(0.0, abs=1e-7)
+
+
+def test_a_free_sole_may_turn_about_the_normal_and_would_rather_not(ik):
+    w, q = ik.world, ik.world.home
+    goal = goal_at(ik, q, "RFoot", "ground", free=True)
+    yawed = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix() @ goal.rotation
+    problem = problem_of(w, replace(goal, rotation=yawed))
+    qp = ik.build(problem, q)
+    np.testing.assert_allclose(hard_rows(qp, w.model.nv)[1], 0.0, atol=1e-6)
+    assert qp.merit == pytest.approx(0.5 * (0.3 * 0.4) ** 2, abs=1e-6)
+    assert ik.residuals(problem, q).contact == pytest.approx(0.0, abs=1e-6)
+    tilted = Rotation.from_rotvec([0.1, 0.0, 0.0]).as_matrix() @ goal.rotation
+    problem = problem_of(w, replace(goal, rotation=tilted))
+    assert ik.residuals(problem, q).contact == pytest.approx(0.1, abs=1e-6)
+
+
+def test_outside_the_support_ellipse_the_centre_of_mass_is_drawn_in(ik):
+    w = ik.world
+    problem = stance(ik, w.home, "both feet", "ground", ellipse_weight=3.0)
+    inside = ik.build(problem, w.home)
+    np.testing.assert_array_equal(inside.c, 0.0)
+    lean = bent(w, 8)
+    lean[3:7] = quat_from_matrix(matrix_from_rpy([0.0, 0.5, 0.0]))
+    wide = stance(ik, lean, "both feet", "ground", ellipse_weight=3.0)
+    qp = ik.build(wide, lean)
+    data = mujoco.MjData(w.model)
+    data.qpos[:] = lean
+    mujoco.mj_forward(w.model, data)
+    com = data.subtree_com[w.base][:2]
+    points = np.concatenate([ik.kin.bearing_points(f, UP) for f in ("LFoot", "RFoot")])
+    excess, gradient = support_ellipse(support_polygon(points[:, :2])).excess(com)
+    assert excess > 0
+    J = ik.kin.com_jacobian()[:2]
+    np.testing.assert_allclose(qp.c, 9.0 * excess * gradient @ J, atol=1e-9)
 
 
 def test_stability_is_weighted_so_that_its_cost_is_that_of_the_method(ik):
@@ -743,6 +813,7 @@ def test_a_simple_stance_is_solved_and_plain_mujoco_agrees(plain):
     problem = stance_problem(plain)
     solution = plain.solve(problem, plain.world.home)
     assert solution.status is Status.SOLVED
+    assert solution.iterations <= 30  # a step that fails is tried again shorter
     truth = measured(plain.world, problem, solution.q)
     r = solution.residuals
     assert truth["contact"] < 5e-4

@@ -297,6 +297,12 @@ def test_pairs_are_those_that_mujoco_would_let_collide(world):
         assert m.geom_bodyid[a] != m.geom_bodyid[b]
         assert m.geom_contype[a] & m.geom_conaffinity[b]
         assert m.body_subtreemass[m.geom_bodyid[[a, b]]].max() <= masses
+    # Neighbours on a joint may overlap, as MuJoCo lets them.
+    for a, b in m.geom_bodyid[world.pairs]:
+        up = m.body_weldid[m.body_parentid[m.body_weldid[[a, b]]]]
+        if m.body_weldid[a] and m.body_weldid[b]:
+            assert up[0] != m.body_weldid[b]
+            assert up[1] != m.body_weldid[a]
     # Whatever touches in some random posture is a pair, or touched at home already.
     known = {tuple(sorted(p)) for p in world.pairs.tolist()}
     found = set()
