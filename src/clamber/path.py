@@ -10,7 +10,7 @@ distance a constraint, so the push is the constraint's doing.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -221,7 +221,7 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
         problem = replace(problem, clearance=clearance)
         return _solve_node(ik, problem, last, reference)
 
-    moving = (*(c.surface for c in t.leaving), made.surface)
+    moving = (*t.leaving, made)
     n = len(control)
     q = _fill(ik, t.shifted, t.touching, n, node, t.held, moving, refine=adapt)
     return q, control
@@ -265,7 +265,7 @@ def _fill(
     points: int,
     node: Callable[[float, np.ndarray], np.ndarray],
     contacts: tuple[Contact, ...],
-    moving: tuple[str, ...],
+    moving: tuple[Contact, ...],
     *,
     refine: bool = True,
 ) -> np.ndarray:
@@ -280,10 +280,10 @@ def _fill(
         points: Number of postures to begin with, ends included.
         node: Posture at a share of the way, given the one before.
         contacts: Closed all the way.
-        moving: Surfaces that may touch any support.
+        moving: Contacts at either end of the way, which may touch their supports.
         refine: Halve gaps at all.
     """
-    watched = watched_pairs(ik.world, contacts, moving)
+    watched = watched_pairs(ik.world, (*contacts, *moving))
     nodes = [(0.0, a)]
     for share in np.linspace(0.0, 1.0, points)[1:-1]:
         nodes.append((float(share), node(float(share), nodes[-1][1])))
@@ -303,16 +303,13 @@ def _fill(
     return np.array([q for _, q in nodes])
 
 
-def watched_pairs(
-    world: World, contacts: tuple[Contact, ...], moving: tuple[str, ...]
-) -> np.ndarray:
-    """(P,) bool: pairs that must not overlap while these surfaces touch supports."""
+def watched_pairs(world: World, contacts: Sequence[Contact]) -> np.ndarray:
+    """(P,) bool: pairs that must not overlap; those of the contacts may."""
     out = np.ones(len(world.pairs), bool)
-    touching = {c.surface: [world.support_geom[c.support]] for c in contacts}
-    touching |= {s: list(world.support_geom.values()) for s in moving}
-    for surface, supports in touching.items():
-        mine = np.isin(world.pairs, world.surfaces[surface].geoms).any(axis=1)
-        out &= ~(mine & np.isin(world.pairs, supports).any(axis=1))
+    for c in contacts:
+        mine = np.isin(world.pairs, world.surfaces[c.surface].geoms).any(axis=1)
+        support = np.isin(world.pairs, world.support_geom[c.support]).any(axis=1)
+        out &= ~(mine & support)
     return out
 
 
@@ -340,9 +337,9 @@ def check_phases(
     """Overlaps and contacts at all postures and half-way between, solver aside."""
     kin, world = ik.kin, ik.world
     worst, note = 0.0, ""
-    moving = t.move.breaks + ((t.move.makes.surface,) if t.move.makes else ())
+    moving = (*t.leaving, t.move.makes) if t.move.makes else t.leaving
     for phase in phases:
-        watched = watched_pairs(world, phase.contacts, moving)
+        watched = watched_pairs(world, (*phase.contacts, *moving))
         for a, b in itertools.pairwise(phase.q):
             for q in (interpolate(kin, a, b, 0.5), b):
                 depth, pair = overlap(ik, q, watched)

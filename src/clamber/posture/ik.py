@@ -48,6 +48,7 @@ CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
+FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
 SOFT, EQUALITY = 8, 5  # daqp's constraint types
 
@@ -228,7 +229,10 @@ def contact_clearance(
             a, b = world.pairs[i]
             geom = int(a if b == g else b)
             planned = name(geom).name == surface or s.is_flat
-            out[i] = -np.inf if planned and surface not in rolling else 0.0
+            if not planned:
+                out[i] = FURTHER_CLEARANCE
+            else:
+                out[i] = 0.0 if surface in rolling else -np.inf
     return out
 
 
