@@ -624,9 +624,10 @@ def test_a_surface_may_touch_the_support_it_stands_on_and_no_other(ik):
     for (a, b), c in zip(w.pairs, allowed, strict=True):
         if c != 0.01:
             changed[frozenset((name(int(a)).name, name(int(b)).name))] = c
+    shin = changed.pop(frozenset(("LKnee_shin", "yawed")))
+    assert 0.0 <= shin < 0.01  # comes closer than others, does not enter
     assert changed == {
         frozenset(("LKnee", "yawed")): -np.inf,  # left to the contact task
-        frozenset(("LKnee_shin", "yawed")): 0.0,  # may touch, not enter
         frozenset(("RFoot", "ground")): -np.inf,
     }
     np.testing.assert_array_equal(free, 0.01)
@@ -906,6 +907,18 @@ def test_feet_that_must_stand_too_close_collide(plain):
     assert solution.status in (Status.COLLIDING, Status.UNREACHABLE)
     a, b = (w.model.geom(int(g)).name for g in w.pairs[solution.residuals.worst_pair])
     assert {a, b} == {"LFoot", "RFoot"}
+
+
+def test_where_nothing_satisfies_all_no_step_is_left_that_would_help(plain):
+    left, right, hand = stance_problem(plain).goals
+    for shift in (0.03, 0.06, 0.09):
+        near = replace(left, position=right.position + np.array([0.0, shift, 0.0]))
+        problem = stance_problem(plain, goals=(near, right, hand))
+        solution = plain.solve(problem, plain.world.home)
+        assert solution.status is not Status.SOLVED
+        qp = plain.build(problem, solution.q)
+        trial = plain.kin.integrate(solution.q, plain.step(qp))
+        assert plain.build(problem, trial).merit > 0.9 * qp.merit
 
 
 def test_the_same_question_has_the_same_answer_to_the_bit(plain):

@@ -553,6 +553,17 @@ def test_a_robot_of_ones_own_stands_and_its_geoms_bear_the_surfaces_names(write_
     assert w.tau_max.tolist() == [40.0] * 8
 
 
+def test_neighbours_on_a_joint_are_no_pair_however_far_apart(write_robot):
+    w = build(write_robot())
+    name = w.model.geom
+    pairs = {frozenset(name(int(g)).name for g in p) for p in w.pairs}
+    assert frozenset(("lupper", "LHand")) not in pairs  # upper arm and forearm
+    assert frozenset(("lthigh", "LFoot")) not in pairs
+    assert frozenset(("pelvis", "LFoot")) in pairs
+    assert frozenset(("LFoot", "RFoot")) in pairs
+    assert frozenset(("LHand", "box")) in pairs
+
+
 @pytest.mark.parametrize("end", ["LFoot", "lsole"])
 def test_a_landmark_may_be_a_surface_or_a_geom_by_its_own_name(write_robot, end):
     w = build(write_robot(ROBOT_YAML.replace("end: LFoot", f"end: {end}")))
