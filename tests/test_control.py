@@ -107,7 +107,7 @@ def test_the_integral_holds_what_feed_forward_does_not_know(demo_plan):
     load, q = 2.0, reference - 0.01
     damping = world.kd + world.model.dof_damping[world.dadr]
     with_integral = world.ki > 0
-    for _ in range(200_000):
+    for _ in range(100_000):
         u = pid.command(0, q)
         q = q + PHYSICS_STEP * (world.kp * (u - q) - load) / damping
-    assert np.abs(q - reference)[with_integral].max() < 0.3 * load / world.kp.min()
+    assert np.abs(q - reference)[with_integral].max() < 0.4 * load / world.kp.min()

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from clamber import path as path_module
 from clamber.errors import Status
 from clamber.path import (
     SAFE_HEIGHT,
@@ -18,7 +19,6 @@ from clamber.path import (
     interpolate,
     overlap,
     plan_path,
-    watched_pairs,
 )
 from clamber.pipeline import plan
 from clamber.posture.ik import IK
@@ -38,6 +38,15 @@ def halves(kin, nodes):
     for a, b in itertools.pairwise(nodes):
         yield interpolate(kin, a, b, 0.5)
         yield b
+
+
+def apart(world, contacts) -> np.ndarray:
+    """(P,) bool: pairs that are no surface on the support it is in contact with."""
+    out = np.ones(len(world.pairs), bool)
+    for c in contacts:
+        mine = np.isin(world.pairs, world.surfaces[c.surface].geoms).any(axis=1)
+        out &= ~(mine & (world.pairs == world.support_geom[c.support]).any(axis=1))
+    return out
 
 
 def limb_to_box(world, q, limb: str, box: str = "box") -> float:
@@ -214,12 +223,34 @@ def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinemat
             # At its very ends the moving surface touches what it leaves and meets.
             closed = phase.contacts
             ends = (*closed, *t.leaving, t.move.makes)
-            inner, outer = (watched_pairs(world, c, ()) for c in (closed, ends))
+            inner, outer = apart(world, closed), apart(world, ends)
             for i, q in enumerate(phase.q):
                 demo_kinematics.update(q)
                 is_end = i in (0, len(phase.q) - 1)
                 near = demo_kinematics.proximity(0.0, outer if is_end else inner)
                 assert near.distance.min(initial=0.0) > -4e-3
+
+
+def test_gaps_are_halved_where_a_contact_drifts(demo_plan, ik, monkeypatch):
+    """From no posture at all between shift, touch and settle."""
+    t = demo_plan.paths[-1].transition
+
+    def worst() -> tuple[float, int]:
+        shift = plan_path(ik, t).phases[0]
+        drift = 0.0
+        for q in halves(ik.kin, shift.q):
+            ik.kin.update(q)
+            drift = max(drift, *(contact_drift(ik.kin, c) for c in shift.contacts))
+        return drift, len(shift.q)
+
+    monkeypatch.setattr(path_module, "BRIDGE_POINTS", 0)
+    refined, many = worst()
+    monkeypatch.setattr(path_module, "MAX_REFINEMENTS", 0)
+    coarse, few = worst()
+    assert few == 2
+    assert many > few
+    assert coarse > 5e-3
+    assert refined < 2.5e-3
 
 
 # Collisions and how they are found.
@@ -266,7 +297,7 @@ def test_overlap_is_the_depth_that_mujoco_measures(demo_plan, ik):
 
 def test_standing_upright_nothing_overlaps(demo_plan, ik):
     key = demo_plan.keyframes[0]
-    watched = watched_pairs(demo_plan.world, key.stance, ())
+    watched = apart(demo_plan.world, key.stance)
     assert overlap(ik, key.q, watched) == (0.0, -1)
 
 

@@ -253,3 +253,15 @@ def test_a_step_skipped_before_and_after_a_repair_is_reported_once(ik, monkeypat
     )
     found = find(ik, fake_steps(("a", 1), ("b", 1), ("c", 2)))
     assert [m.reason for m in found.missed] == ["b fails"]
+
+
+def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
+    contact = fake_steps(("a", 1))[0].move.makes
+    FakePlanner(
+        monkeypatch,
+        lambda name, tried: name in "bc" and "a!" not in tried,
+        lambda limb, paths: None if limb == "b" else (0, contact),
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
+    assert found.keyframes[1:] == ("a!", "b", "c")
+    assert found.missed == ()

@@ -316,7 +316,7 @@ def test_a_goal_in_the_scene_is_reached_within_its_tolerance(
 
 
 @pytest.mark.parametrize("share", [-1.1, -0.9, 0.9, 1.1])
-@pytest.mark.parametrize("facing", [0.0, np.pi])
+@pytest.mark.parametrize("facing", [0.0, 3.3])
 def test_a_goal_with_a_heading_wants_that_heading(
     demo_plan, demo_rollout, share, facing
 ):

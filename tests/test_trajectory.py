@@ -159,6 +159,20 @@ def test_base_quaternions_are_unit_and_never_jump_to_the_other_sign(demo_plan):
     assert np.sum(quat[1:] * quat[:-1], axis=1).min() > 0.999
 
 
+def test_the_other_sign_of_a_posture_s_quaternion_changes_nothing(
+    demo_plan, knee_phases
+):
+    shift = knee_phases[0]
+    flipped = shift.q.copy()
+    flipped[1::2, 3:7] *= -1
+    a, b = (
+        build_trajectory(demo_plan.world, (replace(shift, q=q),), speed=0.3)
+        for q in (shift.q, flipped)
+    )
+    assert np.allclose(a.q, b.q, atol=1e-12)
+    assert np.allclose(a.v, b.v, atol=1e-12)
+
+
 def test_it_passes_through_every_posture_of_every_path_in_order(
     demo_plan, demo_kinematics
 ):
