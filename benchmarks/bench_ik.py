@@ -5,8 +5,7 @@
 COMAN stands on both feet (two 6D equality constraints) while its hands go to two points
 (two 3D tasks) and its centre of mass to the middle of its feet, close to a posture,
 within joint and step limits. From the same postures, each library takes one full step:
-kinematics, rows, QP (DAQP in all three) and integration. Ours also has rows that would
-keep the centre of mass inside the support polygon; they are slack here.
+kinematics, rows, QP (DAQP in all three) and integration.
 """
 
 from __future__ import annotations
@@ -80,7 +79,8 @@ def clamber_step(world: World, *, collisions: bool) -> Step:
         goals=tuple(goals),
         q_reference=world.home,
         clearance=clearance,
-        balance_margin=-0.2,  # never active: the others have no such rows
+        balance=False,  # the others have no such rows
+        com_target=feet_middle(world)[:2],
         com_weight=COM,
         posture_weight=POSTURE,
         base_weight=0.0,

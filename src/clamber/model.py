@@ -753,7 +753,8 @@ class Kinematics:
         s = self.world.surfaces[surface]
         if s.rotation is None:
             raise ValueError(f"{surface} is a point surface: it has no orientation")
-        return rotation_vector(R_WC @ (self.rotation(s.body) @ s.rotation).T)
+        R_WS = self.data.xmat[s.body].reshape(3, 3) @ s.rotation
+        return rotation_vector(R_WC @ R_WS.T)
 
     def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
         """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them."""

@@ -72,8 +72,9 @@ def quat_conjugate(q: ArrayLike) -> np.ndarray:
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
     """Rotation vector (3,) of a rotation matrix (3, 3) [rad]."""
-    out = np.empty(3)
-    mujoco.mju_quat2Vel(out, quat_from_matrix(R), 1.0)
+    quat, out = np.empty(4), np.empty(3)
+    mujoco.mju_mat2Quat(quat, R.ravel())
+    mujoco.mju_quat2Vel(out, quat, 1.0)
     return out
 
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import daqp
+import mujoco
 import numpy as np
 
 from clamber.errors import Status
@@ -101,6 +102,7 @@ class PostureProblem:
         count.
         balance: Keep the centre of mass over the loaded contacts.
         balance_margin: [m] from the border of the support polygon.
+        com_target: (2,) preferred centre of mass; None is the middle of the polygon.
         posture_weight, direction_weight, base_weight, com_weight: Of the soft tasks.
         ellipse_weight: Of holding the centre of mass in the support ellipse (4.28).
         lean: (surface, unit vector (3,) from its contact to the mass it will support,
@@ -116,6 +118,7 @@ class PostureProblem:
     base_rotation: np.ndarray | None = None
     balance: bool = True
     balance_margin: float = 0.025
+    com_target: np.ndarray | None = None
     posture_weight: float = 0.08
     direction_weight: float = 0.0
     base_weight: float = 0.15
@@ -217,7 +220,7 @@ def contact_clearance(
 
     Returns:
         (P,): the planning geom of a contact pair is left to the contact task; further
-        geoms of the surface may touch but not enter.
+        geoms of the surface keep `FURTHER_CLEARANCE`.
     """
     out = clearance.copy()
     name = world.model.geom
@@ -287,10 +290,13 @@ class IK:
         self._jac2 = np.zeros((3, nv))
         self._step = np.full(nv, STEP_ROTATION)
         self._step[:3] = STEP_TRANSLATION
-        joints = np.isfinite(world.q_min) | np.isfinite(world.q_max)
-        self._limited = np.flatnonzero(joints)
-        self._q_of_dof = np.full(nv, -1)
-        self._q_of_dof[world.dadr] = world.qadr
+        limited = np.isfinite(world.q_min[world.dadr])
+        limited |= np.isfinite(world.q_max[world.dadr])
+        self._limited, self._limited_q = world.dadr[limited], world.qadr[limited]
+        self._q_min, self._q_max = (
+            world.q_min[self._limited],
+            world.q_max[self._limited],
+        )
         self._violation = 0.0
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._geom_body = world.model.geom_bodyid
@@ -317,8 +323,7 @@ class IK:
             self._base_rows(problem.base_rotation, problem.base_weight)
         if problem.lean is not None:
             self._lean_rows(*problem.lean)
-        if problem.balance:
-            self._balance_rows(problem)
+        self._balance_rows(problem)
         self._distance_rows(problem.clearance, reach)
 
         nv = w.model.nv
@@ -326,33 +331,32 @@ class IK:
         H = J.T @ J
         c = J.T @ e
         cost = 0.5 * float(e @ e)
-        diagonal = np.full(nv, DAMPING)
+        diagonal = H.reshape(-1)[:: nv + 1]
+        diagonal += DAMPING
         if problem.posture_weight > 0:
-            d = kin.difference(problem.q_reference, q)
             weight = problem.posture_weight**2
-            c[w.dadr] += weight * d[w.dadr]
-            cost += 0.5 * weight * float(d[w.dadr] @ d[w.dadr])
+            off = q[w.qadr] - problem.q_reference[w.qadr]
+            c[w.dadr] += weight * off
             diagonal[w.dadr] += weight
-        H[np.diag_indices(nv)] += diagonal
+            cost += 0.5 * weight * float(off @ off)
 
-        lo, hi = np.full(nv, -1e30), np.full(nv, 1e30)
-        k = self._limited
-        now = q[self._q_of_dof[k]]
-        lo[k] = np.minimum(w.q_min[k] - now, 0.0)
-        hi[k] = np.maximum(w.q_max[k] - now, 0.0)
+        m = nv + hard.n
+        lo, hi = np.empty(m + ineq.n), np.empty(m + ineq.n)
+        lo[:nv], hi[:nv] = -1e30, 1e30
+        now = q[self._limited_q]
+        lo[self._limited] = np.minimum(self._q_min - now, 0.0)
+        hi[self._limited] = np.maximum(self._q_max - now, 0.0)
+        lo[nv:m] = hi[nv:m] = hard.lo[: hard.n]
+        lo[m:], hi[m:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
+        sense = np.zeros(m + ineq.n, np.int32)
+        sense[nv:m], sense[m:] = EQUALITY, SOFT
         return QP(
             H=H,
             c=c,
-            A=np.concatenate([hard.J[: hard.n], ineq.J[: ineq.n]]),
-            lo=np.concatenate([lo, hard.lo[: hard.n], ineq.lo[: ineq.n]]),
-            hi=np.concatenate([hi, hard.lo[: hard.n], ineq.hi[: ineq.n]]),
-            sense=np.concatenate(
-                [
-                    np.zeros(nv, np.int32),
-                    np.full(hard.n, EQUALITY, np.int32),
-                    np.full(ineq.n, SOFT, np.int32),
-                ]
-            ),
+            A=np.concatenate((hard.J[: hard.n], ineq.J[: ineq.n])),
+            lo=lo,
+            hi=hi,
+            sense=sense,
             merit=cost + 0.5 * PENALTY * self._violation,
         )
 
@@ -364,16 +368,15 @@ class IK:
             radius: Share of the largest step that this one may take.
         """
         nv = len(qp.c)
-        lo, hi = qp.lo.copy(), qp.hi.copy()
-        lo[:nv] = np.maximum(lo[:nv], -radius * self._step)
-        hi[:nv] = np.minimum(hi[:nv], radius * self._step)
+        reach, step = radius * RECOVERY_STEP, radius * self._step
         # What is violated is asked to recover only as far as such a step can reach:
         # then every step, however short, points the right way.
-        lo[nv:] = np.minimum(lo[nv:], radius * RECOVERY_STEP)
-        hi[nv:] = np.maximum(hi[nv:], -radius * RECOVERY_STEP)
+        lo, hi = np.minimum(qp.lo, reach), np.maximum(qp.hi, -reach)
+        np.maximum(lo[:nv], -step, out=lo[:nv])
+        np.minimum(hi[:nv], step, out=hi[:nv])
         hard = slice(nv, nv + int(np.count_nonzero(qp.sense == EQUALITY)))
-        lo[hard] = np.maximum(lo[hard], -radius * RECOVERY_STEP)
-        hi[hard] = np.minimum(hi[hard], radius * RECOVERY_STEP)
+        np.maximum(lo[hard], -reach, out=lo[hard])
+        np.minimum(hi[hard], reach, out=hi[hard])
         x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, hi, lo, qp.sense)
         if flag > 0:
             return x
@@ -513,11 +516,20 @@ class IK:
         s, support = self.world.surfaces[g.surface], self.world.supports[g.support]
         n = support.normal
         p = kin.contact_point(g.surface, n, g.edge)
+        if s.is_flat and g.hard and not g.free and g.edge is None:
+            k = self._hard.take(6).start
+            J, e = self._hard.J, self._hard.lo
+            mujoco.mj_jac(
+                kin.world.model, kin.data, J[k : k + 3], J[k + 3 : k + 6], p, s.body
+            )
+            e[k : k + 3] = g.position - p
+            e[k + 3 : k + 6] = kin.flat_error(g.surface, g.rotation)
+            self._violation += _size(e[k : k + 6])
+            return
         jac, rot = kin.jacobians(s.body, p)
         if s.radius > 0 and g.link is None:
             # The touching point stays under the centre: it moves as that does.
             jac = kin.point_jacobian(s.body, p + s.radius * n)
-        target = g.position + kin.roll(g.surface, n, g.link)
         if not g.hard:
             self._target(jac, p - g.position, g.reference)
             if s.is_flat:
@@ -538,19 +550,13 @@ class IK:
             self._target(axis[None] @ rot, -(axis @ turn)[None], FLAT_WEIGHT)
             return
         if not g.free:
-            m = 6 if s.is_flat else 3
-            self._violation += _size(target - p)
-            k = self._hard.take(m)
-            self._hard.J[k.start : k.start + 3] = jac
-            self._hard.lo[k.start : k.start + 3] = target - p
-            if s.radius > 0 and g.link is not None:
+            k = self._hard.take(3)
+            self._hard.J[k] = jac
+            self._hard.lo[k] = g.position + kin.roll(g.surface, n, g.link) - p
+            self._violation += _size(self._hard.lo[k])
+            if g.link is not None:
                 centre = kin.point_jacobian(s.body, p + s.radius * n)
                 self._inside(*self._edges[g.support], p, centre)
-            if s.is_flat:
-                turn = kin.flat_error(g.surface, g.rotation)
-                self._violation += _size(turn)
-                self._hard.J[k.start + 3 : k.stop] = rot
-                self._hard.lo[k.start + 3 : k.stop] = turn
             return
         k = self._hard.take(3 if s.is_flat else 1)
         self._violation += float(support.height(p)) ** 2
@@ -600,8 +606,8 @@ class IK:
 
     def _target(self, J: np.ndarray, e: np.ndarray, weight: float) -> None:
         k = self._soft.take(len(e))
-        self._soft.J[k] = weight * J
-        self._soft.lo[k] = weight * e
+        np.multiply(J, weight, out=self._soft.J[k])
+        np.multiply(e, weight, out=self._soft.lo[k])
 
     def _base_rows(self, R_WB: np.ndarray, weight: float) -> None:
         w = self.world
@@ -692,11 +698,16 @@ class IK:
         rows -= (A[:, :, None] * edge).sum(axis=1)
 
     def _balance_rows(self, problem: PostureProblem) -> None:
+        com = self.kin.com[:2].copy()
+        if problem.com_target is not None and problem.com_weight > 0:
+            J = self.kin.com_jacobian()[:2]
+            self._target(J, com - problem.com_target, problem.com_weight)
+        if not problem.balance:
+            return
         movers, points = self._bearing(problem)
         if not movers:
             return
         polygon = support_polygon(points[:, :2])
-        com = self.kin.com[:2].copy()
         J = self.kin.com_jacobian()[:2].copy()
         A, b = polygon_halfplanes(polygon)
         room = b - problem.balance_margin - A @ com
@@ -707,7 +718,7 @@ class IK:
             self._polygon_motion(A, polygon, com, movers, points, self._ineq.J[k])
         self._ineq.hi[k] = room
         self._ineq.lo[k] = -1e30
-        if problem.com_weight > 0:
+        if problem.com_target is None and problem.com_weight > 0:
             self._target(J, com - polygon.mean(axis=0), problem.com_weight)
         if problem.ellipse_weight > 0:
             excess, gradient = support_ellipse(polygon).excess(com)
