@@ -648,6 +648,11 @@ class Kinematics:
         self._jacr = np.zeros((3, m.nv))
         self._fromto = np.zeros(6)
         self._turn = np.zeros(3)
+        # Views of the data: asking for them anew at each use costs more than the use.
+        self._xpos = self.data.xpos
+        self._xmat = self.data.xmat.reshape(-1, 3, 3)
+        self._xquat = self.data.xquat
+        self._com = self.data.subtree_com[world.base]
         first, second = world.pairs.T
         self._first, self._second = first, second
         radius = m.geom_rbound.copy()
@@ -677,7 +682,7 @@ class Kinematics:
     @property
     def com(self) -> np.ndarray:
         """(3,) centre of mass of the robot in the world."""
-        return self.data.subtree_com[self.world.base]
+        return self._com
 
     def com_jacobian(self) -> np.ndarray:
         """(3, nv), valid until the next call."""
@@ -688,11 +693,11 @@ class Kinematics:
 
     def rotation(self, body: int) -> np.ndarray:
         """(3, 3) R_WB."""
-        return self.data.xmat[body].reshape(3, 3)
+        return self._xmat[body]
 
     def point(self, body: int, p_B: np.ndarray) -> np.ndarray:
         """(..., 3) world position of points (..., 3) of a body."""
-        return self.data.xpos[body] + p_B @ self.data.xmat[body].reshape(3, 3).T
+        return self._xpos[body] + p_B @ self._xmat[body].T
 
     def point_jacobian(
         self, body: int, point: np.ndarray, out: np.ndarray | None = None
@@ -719,7 +724,8 @@ class Kinematics:
     ) -> np.ndarray:
         """(3,) the surface's point that touches a support with that normal."""
         s = self.world.surface(surface, edge)
-        return self.point(s.body, s.centre) - s.radius * normal
+        p = self._xpos[s.body] + self._xmat[s.body] @ s.centre
+        return p - s.radius * normal if s.radius else p
 
     def bearing_points(
         self, surface: str, normal: np.ndarray, edge: int | None = None
@@ -743,7 +749,7 @@ class Kinematics:
         s = self.world.surfaces[surface]
         if link is None or s.radius == 0.0:
             return np.zeros(3)
-        mujoco.mju_subQuat(self._turn, self.data.xquat[s.body], link)
+        mujoco.mju_subQuat(self._turn, self._xquat[s.body], link)
         x, y, z = (s.radius * (self.rotation(s.body) @ self._turn)).tolist()
         nx, ny, nz = normal.tolist()
         return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
@@ -753,8 +759,7 @@ class Kinematics:
         s = self.world.surfaces[surface]
         if s.rotation is None:
             raise ValueError(f"{surface} is a point surface: it has no orientation")
-        R_WS = self.data.xmat[s.body].reshape(3, 3) @ s.rotation
-        return rotation_vector(R_WC @ R_WS.T)
+        return rotation_vector(R_WC @ (self._xmat[s.body] @ s.rotation).T)
 
     def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
         """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them."""

@@ -7,7 +7,7 @@ normal; its convex polygon is given in that frame's x and y, counter-clockwise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -45,6 +45,7 @@ class Support:
         rotation: (3, 3) R_WP; its last column is the outward normal.
         polygon: (K, 2) vertices in P, counter-clockwise [m].
         friction: Coulomb coefficient mu.
+        normal: (3,) outward normal in the world.
     """
 
     name: str
@@ -52,21 +53,18 @@ class Support:
     rotation: np.ndarray
     polygon: np.ndarray
     friction: float
+    normal: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         """Copy the arrays and check that the polygon is convex, ccw."""
         object.__setattr__(self, "position", _frozen(self.position, (3,)))
         object.__setattr__(self, "rotation", _frozen(self.rotation, (3, 3)))
+        object.__setattr__(self, "normal", _frozen(self.rotation[:, 2], (3,)))
         object.__setattr__(self, "polygon", _frozen(self.polygon, (-1, 2)))
         edges = np.roll(self.polygon, -1, axis=0) - self.polygon
         nxt = np.roll(edges, -1, axis=0)
         if np.any(edges[:, 0] * nxt[:, 1] - edges[:, 1] * nxt[:, 0] <= 0):
             raise ValueError(f"support {self.name}: polygon is not convex, ccw")
-
-    @property
-    def normal(self) -> np.ndarray:
-        """(3,) outward normal in the world."""
-        return self.rotation[:, 2]
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (...,) of world points (..., 3) over the plane [m]."""

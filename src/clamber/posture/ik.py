@@ -263,7 +263,8 @@ class _Rows:
 class QP:
     """min 1/2 x'Hx + c'x with bounds on x first, then rows `lo <= A x <= hi`.
 
-    `merit` is the exact-penalty cost of the configuration it was built at.
+    `equalities` rows come first; `merit` is the penalised cost of the configuration it
+    was built at.
     """
 
     H: np.ndarray
@@ -272,6 +273,7 @@ class QP:
     lo: np.ndarray
     hi: np.ndarray
     sense: np.ndarray
+    equalities: int
     merit: float
 
 
@@ -290,6 +292,8 @@ class IK:
         self._jac2 = np.zeros((3, nv))
         self._step = np.full(nv, STEP_ROTATION)
         self._step[:3] = STEP_TRANSLATION
+        self._joints = np.zeros(nv)
+        self._joints[world.dadr] = 1.0
         limited = np.isfinite(world.q_min[world.dadr])
         limited |= np.isfinite(world.q_max[world.dadr])
         self._limited, self._limited_q = world.dadr[limited], world.qadr[limited]
@@ -331,13 +335,11 @@ class IK:
         H = J.T @ J
         c = J.T @ e
         cost = 0.5 * float(e @ e)
-        diagonal = H.reshape(-1)[:: nv + 1]
-        diagonal += DAMPING
-        if problem.posture_weight > 0:
-            weight = problem.posture_weight**2
+        weight = problem.posture_weight**2
+        H.reshape(-1)[:: nv + 1] += DAMPING + weight * self._joints
+        if weight > 0:
             off = q[w.qadr] - problem.q_reference[w.qadr]
             c[w.dadr] += weight * off
-            diagonal[w.dadr] += weight
             cost += 0.5 * weight * float(off @ off)
 
         m = nv + hard.n
@@ -357,6 +359,7 @@ class IK:
             lo=lo,
             hi=hi,
             sense=sense,
+            equalities=hard.n,
             merit=cost + 0.5 * PENALTY * self._violation,
         )
 
@@ -374,7 +377,7 @@ class IK:
         lo, hi = np.minimum(qp.lo, reach), np.maximum(qp.hi, -reach)
         np.maximum(lo[:nv], -step, out=lo[:nv])
         np.minimum(hi[:nv], step, out=hi[:nv])
-        hard = slice(nv, nv + int(np.count_nonzero(qp.sense == EQUALITY)))
+        hard = slice(nv, nv + qp.equalities)
         np.maximum(lo[hard], -reach, out=lo[hard])
         np.minimum(hi[hard], reach, out=hi[hard])
         x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, hi, lo, qp.sense)
@@ -526,16 +529,21 @@ class IK:
             e[k + 3 : k + 6] = kin.flat_error(g.surface, g.rotation)
             self._violation += _size(e[k : k + 6])
             return
+        if not g.hard and not s.is_flat:
+            k = self._soft.take(3).start
+            J = self._soft.J[k : k + 3]
+            kin.point_jacobian(s.body, p + s.radius * n, J)
+            J *= g.reference
+            self._soft.lo[k : k + 3] = g.reference * (p - g.position)
+            return
         jac, rot = kin.jacobians(s.body, p)
         if s.radius > 0 and g.link is None:
             # The touching point stays under the centre: it moves as that does.
             jac = kin.point_jacobian(s.body, p + s.radius * n)
         if not g.hard:
             self._target(jac, p - g.position, g.reference)
-            if s.is_flat:
-                self._target(
-                    rot, -kin.flat_error(g.surface, g.rotation), 0.3 * g.reference
-                )
+            turn = kin.flat_error(g.surface, g.rotation)
+            self._target(rot, -turn, 0.3 * g.reference)
             return
         if g.edge is not None:
             turn = kin.flat_error(g.surface, g.rotation)
