@@ -294,13 +294,10 @@ class IK:
         self._step[:3] = STEP_TRANSLATION
         self._joints = np.zeros(nv)
         self._joints[world.dadr] = 1.0
-        limited = np.isfinite(world.q_min[world.dadr])
-        limited |= np.isfinite(world.q_max[world.dadr])
-        self._limited, self._limited_q = world.dadr[limited], world.qadr[limited]
-        self._q_min, self._q_max = (
-            world.q_min[self._limited],
-            world.q_max[self._limited],
-        )
+        self._dofs, self._angles = _as_slice(world.dadr), _as_slice(world.qadr)
+        self._q_min = np.maximum(world.q_min[world.dadr], -1e30)
+        self._q_max = np.minimum(world.q_max[world.dadr], 1e30)
+        self._senses: dict[tuple[int, int], np.ndarray] = {}
         self._violation = 0.0
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._geom_body = world.model.geom_bodyid
@@ -338,30 +335,37 @@ class IK:
         weight = problem.posture_weight**2
         H.reshape(-1)[:: nv + 1] += DAMPING + weight * self._joints
         if weight > 0:
-            off = q[w.qadr] - problem.q_reference[w.qadr]
-            c[w.dadr] += weight * off
+            off = q[self._angles] - problem.q_reference[self._angles]
+            c[self._dofs] += weight * off
             cost += 0.5 * weight * float(off @ off)
 
         m = nv + hard.n
         lo, hi = np.empty(m + ineq.n), np.empty(m + ineq.n)
         lo[:nv], hi[:nv] = -1e30, 1e30
-        now = q[self._limited_q]
-        lo[self._limited] = np.minimum(self._q_min - now, 0.0)
-        hi[self._limited] = np.maximum(self._q_max - now, 0.0)
+        now = q[self._angles]
+        lo[self._dofs] = np.minimum(self._q_min - now, 0.0)
+        hi[self._dofs] = np.maximum(self._q_max - now, 0.0)
         lo[nv:m] = hi[nv:m] = hard.lo[: hard.n]
         lo[m:], hi[m:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
-        sense = np.zeros(m + ineq.n, np.int32)
-        sense[nv:m], sense[m:] = EQUALITY, SOFT
         return QP(
             H=H,
             c=c,
             A=np.concatenate((hard.J[: hard.n], ineq.J[: ineq.n])),
             lo=lo,
             hi=hi,
-            sense=sense,
+            sense=self._sense(hard.n, ineq.n),
             equalities=hard.n,
             merit=cost + 0.5 * PENALTY * self._violation,
         )
+
+    def _sense(self, equalities: int, inequalities: int) -> np.ndarray:
+        """(nv + m,) daqp's constraint types: bounds, contacts, softened rows."""
+        key = (equalities, inequalities)
+        if key not in self._senses:
+            counts = (self.world.model.nv, equalities, inequalities)
+            sense = np.repeat(np.array([0, EQUALITY, SOFT], np.int32), counts)
+            self._senses[key] = sense
+        return self._senses[key]
 
     def step(self, qp: QP, radius: float = 1.0) -> np.ndarray:
         """Solve; contacts that contradict one another become soft, heavily weighted.
@@ -777,6 +781,14 @@ class IK:
         self._violation += _size(np.maximum(short, 0.0))
         self._ineq.lo[k] = short
         self._ineq.hi[k] = 1e30
+
+
+def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
+    """The same indices as a slice where they are consecutive: indexing is cheaper."""
+    first = int(indices[0])
+    if np.array_equal(indices, np.arange(first, first + len(indices))):
+        return slice(first, first + len(indices))
+    return indices
 
 
 def _size(e: np.ndarray) -> float:
