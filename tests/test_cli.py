@@ -211,7 +211,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         cost_after=0.125,
     )
     move = SimpleNamespace(transition=SimpleNamespace(move="air -> LHand on table"))
-    skipped = SimpleNamespace(stance=3, reason="out of reach [0.4 m]")
+    skipped = SimpleNamespace(stance=3, reason="out of reach [0.4 m]", missed=True)
     plan = SimpleNamespace(
         keyframes=(keyframe, keyframe),
         paths=(move,),
@@ -352,8 +352,9 @@ def test_a_plan_without_any_move_is_not_simulated(
 def test_an_incomplete_plan_gives_the_reason_of_the_first_move_missed(
     stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ):
-    merged = SimpleNamespace(stance=5, reason="left leg in the air: of its next move")
-    missed = SimpleNamespace(stance=6, reason="LFoot -> LKnee on table: too high")
+    merged = SimpleNamespace(stance=5, reason="left leg in the air", missed=False)
+    reason = "LFoot -> LKnee on table: too high"
+    missed = SimpleNamespace(stance=6, reason=reason, missed=True)
     stages.plan.skipped, stages.plan.complete = (merged, missed), False
     stages.verdict.reached = False
     for command in (["climb"], ["plan", "sequence.json"]):

@@ -144,7 +144,7 @@ class ContactSequence:
     intervals: tuple[ContactInterval, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check times and that contacts which go on keep their pose."""
+        """Check that times increase and that the scene has every support."""
         t = np.array(self.t, dtype=float)
         if t.shape != (len(self.stances) + 1,) or not np.all(np.diff(t) > 0):
             raise ValueError("times must increase, one more than there are stances")

@@ -54,7 +54,7 @@ class Plan:
         paths: Between neighbouring keyframes.
         skipped: Stances left out, and steps for which there is no way.
         trajectory: None where not even one move was found.
-        complete: The last stance of the demonstration was reached.
+        complete: Every step that the demonstration asks for has a path.
         timings: Seconds by stage.
     """
 

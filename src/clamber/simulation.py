@@ -41,12 +41,14 @@ class Rollout:
         actuator_force: (M, nu) [N m]; contact_force: (M, nS, 3) [N] on each surface, in
             the world; unintended: (M,) normal force on other parts [N].
         surfaces: Names of the nS surfaces.
-        overlap: Deepest overlap of the robot with itself and of anything else [m].
+        overlap: Deepest overlap of any contact [m].
         end_share: Vertical force, share of the weight, by `surface@support` over the
         last
             second; other parts are called `other`.
         unintended_share: Normal impulse on other parts over that on all.
-        contact_tracking: (M,) contacts planned closed that are.
+        self_overlap: Deepest overlap of the robot with itself [m]; self_pair: where.
+        unintended_parts: The same share by part.
+        end_speed: Largest pelvis speed over the last second [m/s].
     """
 
     ctrl: np.ndarray
@@ -154,7 +156,7 @@ def _run(
         self_overlap=self_overlap,
         self_pair=pair,
         end_share={k: v / weight for k, v in sorted(meter.end.items())},
-        unintended_share=meter.other / max(meter.total, 1e-9),
+        unintended_share=float(meter.other / max(meter.total, 1e-9)),
         unintended_parts={
             k: v / max(meter.total, 1e-9) for k, v in sorted(meter.parts.items())
         },
@@ -243,7 +245,9 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     up, up_planned = (_up(q[3:7]) for q in (last, planned))
     tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
     tops = [world.supports[c.support].position[2] for c in final]
-    effort = float(np.abs(rollout.actuator_force).max() / world.tau_max.max())
+    order = [world.model.actuator(j).id for j in world.joints]
+    share = np.abs(rollout.actuator_force[:, order]) / world.tau_max
+    effort = float(share.max(initial=0.0))
     goal = {
         "planned to the last stance": _at_least(float(plan.complete), 1.0),
         "share of the weight at the end on planned contacts": _at_least(

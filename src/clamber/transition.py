@@ -87,8 +87,10 @@ def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarr
     comes on.
     """
     pitch, roll, _ = reach_to_support(p1, p2, R_WB)
-    horizontal = R_WB @ np.array([np.sin(pitch), np.sin(roll), 0.0])
+    horizontal = R_WB @ np.array([pitch, roll, 0.0])
     horizontal[2] = 0.0
+    angle = float(np.linalg.norm(horizontal))
+    horizontal *= np.sin(angle) / max(angle, 1e-9)
     return horizontal + np.array(
         [0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))]
     )

@@ -38,7 +38,7 @@ class Alternation:
         self.before, _ = stability_cost(
             ik.kin, task, references, options.stability_weight
         )
-        self.lowest = np.inf
+        self.lowest, self.best = np.inf, np.zeros(0)
         margins = [
             (s.polygon.min(axis=0), s.polygon.max(axis=0)) for s in self.supports
         ]
@@ -82,19 +82,19 @@ class Alternation:
             self.options.stability_weight,
         )
         if cost < self.lowest:
-            self.lowest, self.q = cost, q
+            self.lowest, self.q, self.best = cost, q, x.copy()
         for i, s in enumerate(self.supports):
             grad[i] = s.rotation[:2, :2].T @ grad[i]
         return cost, grad.ravel()
 
-    def finish(self, x: np.ndarray, *, method: str, iterations: int) -> Keyframe:
-        """The posture for the final positions, measured."""
+    def finish(self, *, method: str, iterations: int) -> Keyframe:
+        """The posture for the best positions evaluated, measured."""
         self.lowest = np.inf
         return finish(
             self.ik,
             self.task,
             self.options,
-            self._solve(x),
+            self._solve(self.best),
             method=method,
             iterations=iterations,
             cost_before=self.before,

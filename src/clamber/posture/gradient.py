@@ -39,4 +39,4 @@ def optimise(
         x, cost, grad = trial, trial_cost, trial_grad
         if change < options.delta_stop:
             break
-    return alternation.finish(x, method="gradient", iterations=n)
+    return alternation.finish(method="gradient", iterations=n)

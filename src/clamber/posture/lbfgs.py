@@ -18,7 +18,7 @@ def optimise(
     alternation = Alternation(ik, task, q, options)
     x = alternation.start()
     if len(x) == 0:
-        return alternation.finish(x, method="lbfgs", iterations=0)
+        return alternation.finish(method="lbfgs", iterations=0)
 
     # In units in which a step along the gradient is X - S, what (4.24) asks for: the
     # method's first step is as long as the gradient, and would leave the robot's reach.
@@ -42,5 +42,4 @@ def optimise(
             "gtol": options.gradient_stop,
         },
     )
-    x = result.x / unit
-    return alternation.finish(x, method="lbfgs", iterations=int(result.nit))
+    return alternation.finish(method="lbfgs", iterations=int(result.nit))
