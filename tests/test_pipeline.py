@@ -7,12 +7,15 @@ import subprocess
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import yaml
 
 from clamber.errors import InputError, Status
 from clamber.io import save_plan, save_rollout
+from clamber.model import ROBOTS, load_robot
 from clamber.pipeline import PlanOptions, plan
 from clamber.posture.keyframe import equilibrium_at
 from clamber.scene import Box, Scene
@@ -288,3 +291,69 @@ def test_the_judge_refuses_runs_that_were_tampered_with(
     scene.write_text(light)
     names = refused(ask_judge(tmp_path, 0.275))
     assert {"gravity is on, step is 1 ms", replay} <= names.keys()
+
+
+def test_a_box_where_the_robot_stands_is_named(coman, demo_sequence):
+    box = Scene.from_height(0.3).boxes[0]
+    inside = replace(box, position=box.position - [0.4, 0.0, 0.0])
+    scene = Scene(boxes=(inside,), start=np.zeros(3))
+    with pytest.raises(InputError, match=r"scene.start.*box") as error:
+        plan(demo_sequence, coman, scene)
+    assert error.value.field == "scene.start"
+
+
+def test_a_home_beyond_the_effort_limits_is_refused_with_the_joint_that_gives_way(
+    tmp_path, coman, demo_sequence
+):
+    weak = coman.path.read_text().replace(
+        'actuatorfrcrange="-50 50"', 'actuatorfrcrange="-3 3"'
+    )
+    (tmp_path / "weak.xml").write_text(weak)
+    robot = replace(coman, path=tmp_path / "weak.xml")
+    with pytest.raises(InputError, match=r"Knee.* gives way") as error:
+        plan(demo_sequence, robot, Scene.from_height(0.275))
+    assert error.value.field == "robot.home"
+
+
+def test_a_home_that_topples_is_refused(coman, demo_sequence):
+    robot = replace(coman, home={**coman.home, "WaistSag": 0.8, "LShSag": -1.5})
+    robot = replace(robot, home={**robot.home, "RShSag": -1.5, "LAnkSag": -0.2})
+    robot = replace(robot, home={**robot.home, "RAnkSag": -0.2})
+    with pytest.raises(InputError, match="a posture that stands"):
+        plan(demo_sequence, robot, Scene.from_height(0.275))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.8, 1.3])
+def test_a_robot_of_another_size_and_other_names_climbs_too(
+    tmp_path, scale, demo_sequence
+):
+    robot = load_robot(scaled_coman(tmp_path, scale))
+    found = plan(demo_sequence, robot, Scene.from_height(0.275 * scale))
+    assert found.complete
+    assert judge(found, simulate(found)).reached
+
+
+def scaled_coman(folder: Path, scale: float) -> Path:
+    """A robot.yaml of COMAN scaled in length, its geoms under names of their own."""
+    source = ROBOTS / "coman"
+    tree = ElementTree.parse(source / "coman.xml")
+    renamed = {"LHand": "left_fist", "RHand": "right_fist", "LKnee": "kl"}
+    for e in tree.getroot().iter():
+        powers = {"pos": 1, "mass": 3, "fullinertia": 5, "actuatorfrcrange": 4}
+        if e.tag == "geom":
+            powers |= {"size": 1, "fromto": 1}
+        for name, power in powers.items():
+            if name in e.attrib and e.tag not in ("option", "global", "map"):
+                numbers = [float(x) * scale**power for x in e.attrib[name].split()]
+                e.set(name, " ".join(map(repr, numbers)))
+        for old, new in renamed.items():
+            if e.tag == "geom" and e.get("name", "").startswith(old):
+                e.set("name", new + e.attrib["name"].removeprefix(old))
+    tree.write(folder / "scaled.xml")
+    fields = yaml.safe_load((source / "robot.yaml").read_text())
+    fields |= {"name": "scaled", "model": "scaled.xml", "surfaces": renamed}
+    gain = scale**4
+    fields["gains"] = {"default": {"kp": 600 * gain, "kd": 20 * gain, "ki": 9}}
+    (folder / "robot.yaml").write_text(yaml.safe_dump(fields))
+    return folder / "robot.yaml"

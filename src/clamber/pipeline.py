@@ -16,12 +16,12 @@ from clamber.contact import ContactSequence
 from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
 from clamber.moves import Skipped, split_moves
-from clamber.path import Path
+from clamber.path import Path, overlap, watched_pairs
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
 from clamber.scene import Scene
-from clamber.search import plan_steps
+from clamber.search import plan_steps, standing
 from clamber.trajectory import Trajectory, build_trajectory
 
 Method = Literal["direct", "lbfgs", "gradient"]
@@ -92,6 +92,7 @@ def plan(
     world = build_world(robot, scene)
     ik = IK(world)
     check_reach(ik)
+    check_start(ik, standing(ik, options.keyframe))
     goal = retarget(sequence, world)
     clock.lap("retarget")
 
@@ -132,6 +133,32 @@ class _Clock:
         now = time.perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
         self._last = now
+
+
+def check_start(ik: IK, start: Keyframe) -> None:
+    """A robot that cannot stand, or stands in a box, is the user's mistake.
+
+    Raises:
+        InputError: The robot's home posture falls over or exceeds its effort limits, or
+            a box is where it stands.
+    """
+    world = ik.world
+    depth, pair = overlap(ik, start.q, watched_pairs(world, start.stance))
+    names = (
+        [] if pair < 0 else [world.model.geom(int(g)).name for g in world.pairs[pair]]
+    )
+    boxes = [b.name for b in world.scene.boxes if b.name in names]
+    if depth > 0 and boxes:
+        raise InputError(
+            "a start where no box is", field="scene.start", value=" and ".join(names)
+        )
+    if start.com_margin < 0 or not start.equilibrium.feasible:
+        limit = start.equilibrium.limiting
+        raise InputError(
+            "a posture that stands within the effort limits"
+            + (f" ({limit} gives way)" if limit else ""),
+            field="robot.home",
+        )
 
 
 def check_reach(ik: IK) -> None:
