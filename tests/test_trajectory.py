@@ -10,15 +10,17 @@ import pytest
 from scipy.optimize import nnls
 
 from clamber.posture.keyframe import bearing_frames
-from clamber.statics import cone_generators
+from clamber.statics import com_margin, cone_generators, support_polygon
 from clamber.trajectory import (
     BASE_LENGTH,
+    GRAVITY,
     HOLD_END,
     HOLD_START,
     RATE,
     build_trajectory,
     holding_torque,
     phase_torques,
+    zero_moment_point,
 )
 
 
@@ -292,3 +294,57 @@ def test_arrays_of_different_length_are_refused(demo_plan):
 def test_arrays_are_read_only(demo_plan):
     with pytest.raises(ValueError, match="read-only"):
         demo_plan.trajectory.q[0, 0] = 1.0
+
+
+def test_no_moment_is_left_about_the_zero_moment_point(rng):
+    com = rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.8], (50, 3))
+    acceleration = rng.normal(0.0, 2.0, (50, 3))
+    z = 0.1
+    p = zero_moment_point(com, acceleration, z)
+    arm = com - np.column_stack([p, np.full(50, z)])
+    moment = np.cross(arm, [*acceleration, 0.0, 0.0, GRAVITY])
+    assert np.abs(moment[:, :2]).max() < 1e-12
+
+
+def test_at_rest_the_zero_moment_point_is_below_the_centre_of_mass(rng):
+    com = rng.normal(0.0, 1.0, (20, 3))
+    assert np.array_equal(zero_moment_point(com, np.zeros((20, 3)), 0.0), com[:, :2])
+
+
+def lowest_dynamic_margin(kin, world, phases, speed: float) -> float:
+    """Least margin of the zero-moment point, from the sampled motion alone [m]."""
+    worst = np.inf
+    for phase in phases:
+        motion = build_trajectory(world, [phase], speed=speed)
+        com = []
+        for q in motion.q[::10]:
+            kin.update(q)
+            com.append(kin.com.copy())
+        com = np.array(com)
+        acceleration = (com[2:] - 2 * com[1:-1] + com[:-2]) * (RATE / 10) ** 2
+        kin.update(phase.q[-1])
+        points = bearing_frames(kin, phase.contacts)[1]
+        polygon = support_polygon(points[:, :2])
+        p = zero_moment_point(com[1:-1], acceleration, points[:, 2].min())
+        worst = min(worst, min(com_margin(x, polygon) for x in p))
+    return worst
+
+
+def test_a_fast_motion_is_slowed_down_until_inertia_leaves_it_balanced(
+    demo_plan, demo_kinematics, monkeypatch
+):
+    first = demo_plan.paths[0].phases  # standing: nothing but the feet
+    world = demo_plan.world
+    margin = lowest_dynamic_margin(demo_kinematics, world, first, 2.0)
+    assert margin > 0.0
+    unlimited = "clamber.trajectory._balanced_cruise"
+    monkeypatch.setattr(unlimited, lambda kin, phase, curve, length, cruise: cruise)
+    assert lowest_dynamic_margin(demo_kinematics, world, first, 2.0) < -0.01 < margin
+
+
+def test_a_slow_motion_goes_at_the_speed_that_was_asked_for(demo_plan):
+    swing = next(p for p in demo_plan.paths[0].phases if p.kind == "swing")
+    slow = build_trajectory(demo_plan.world, [swing], speed=0.1)
+    fastest = np.abs(slow.v).max(axis=0)
+    fastest[:3] /= BASE_LENGTH
+    assert fastest.max() == pytest.approx(0.1, rel=0.02)

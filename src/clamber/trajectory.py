@@ -24,7 +24,7 @@ from clamber.model import Kinematics, World
 from clamber.path import Phase
 from clamber.posture.keyframe import bearing_frames
 from clamber.se3 import quat_conjugate, quat_multiply
-from clamber.statics import contact_forces
+from clamber.statics import com_margin, contact_forces, support_polygon
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
@@ -33,6 +33,11 @@ HOLD_END = 2.0  # [s] the last posture is held
 ACCELERATION = 4.0  # [1/s] the cruise speed is reached after a quarter of a second
 MIN_PHASE = 0.2  # [s]
 BASE_LENGTH = 0.3  # [m] of base translation count as one radian
+INERTIA_SHARE = 0.6  # of the balance margin that inertia may use up
+BALANCE_SAMPLES = 24  # of the centre of mass along a phase
+BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
+SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
+GRAVITY = 9.81  # [m/s^2]
 SAMPLES = 24  # per gap between two postures, to find the largest speed
 
 
@@ -159,7 +164,55 @@ def _spline(kin: Kinematics, phase: Phase, speed: float, v_max: np.ndarray) -> _
     slope[:, :3] /= BASE_LENGTH
     limit = np.minimum(speed, v_max)
     cruise = float((limit / np.maximum(slope.max(axis=0), 1e-9)).min())
+    cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
     return _Spline(curve, tau, float(s[-1]), cruise)
+
+
+def zero_moment_point(
+    com: np.ndarray, acceleration: np.ndarray, z: float
+) -> np.ndarray:
+    """(n, 2) where the ground force acts if all mass were at the centre of mass.
+
+    p = c - (c_z - z) / (g + a_z) a, over the horizontal: what the inertia of a fast
+    motion adds to the projection of the centre of mass [Vukobratovic04].
+
+    Args:
+        com: (n, 3) [m].
+        acceleration: (n, 3) of the centre of mass [m/s^2].
+        z: Height of the contacts [m].
+    """
+    lever = (com[:, 2] - z) / (GRAVITY + acceleration[:, 2])
+    return com[:, :2] - lever[:, None] * acceleration[:, :2]
+
+
+def _balanced_cruise(
+    kin: Kinematics, phase: Phase, curve: CubicSpline, length: float, cruise: float
+) -> float:
+    """The cruise speed, reduced until inertia leaves the robot its balance.
+
+    The zero-moment point may use up `INERTIA_SHARE` of the distance that the centre of
+    mass has to the border of the support polygon.
+    """
+    fine = np.linspace(0.0, length, BALANCE_SAMPLES)
+    com = np.empty((len(fine), 3))
+    for i, q in enumerate(_on_manifold(curve(fine), curve(fine, 1))[0]):
+        kin.update(q)
+        com[i] = kin.com
+    path = CubicSpline(fine, com)
+    points = bearing_frames(kin, phase.contacts)[1]
+    polygon = support_polygon(points[:, :2])
+    low = float(points[:, 2].min())
+    room = np.array([max(com_margin(c, polygon), 0.0) for c in com])
+    for _ in range(MAX_SLOWINGS):
+        s, rate = _profile(length, cruise)[::BALANCE_STRIDE].T
+        change = np.gradient(rate, BALANCE_STRIDE / RATE)
+        acceleration = path(s, 2) * rate[:, None] ** 2 + path(s, 1) * change[:, None]
+        p = zero_moment_point(path(s), acceleration, low)
+        margin = np.array([com_margin(x, polygon) for x in p])
+        if np.all(margin >= (1.0 - INERTIA_SHARE) * np.interp(s, fine, room)):
+            break
+        cruise *= SLOWING
+    return cruise
 
 
 def _profile(length: float, cruise: float) -> np.ndarray:
