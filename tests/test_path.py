@@ -305,7 +305,7 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
     demo_sequence, coman
 ):
     """Figure 4.16: a high box right before the shins, both knees on their way up."""
-    height, face = 0.44, 0.15
+    height, face = 0.46, 0.19
     box = Box(
         name="box",
         size=np.array([1.0, 1.2, height]),

@@ -302,7 +302,7 @@ def test_no_moment_is_left_about_the_zero_moment_point(rng):
     z = 0.1
     p = zero_moment_point(com, acceleration, z)
     arm = com - np.column_stack([p, np.full(50, z)])
-    moment = np.cross(arm, [*acceleration, 0.0, 0.0, GRAVITY])
+    moment = np.cross(arm, acceleration + np.array([0.0, 0.0, GRAVITY]))
     assert np.abs(moment[:, :2]).max() < 1e-9
 
 

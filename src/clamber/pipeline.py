@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -25,6 +25,15 @@ from clamber.search import plan_steps, standing
 from clamber.trajectory import Trajectory, build_trajectory
 
 Method = Literal["direct", "lbfgs", "gradient"]
+# Where a step is missed, the search begins again with other weights of the keyframes:
+# they lead it to other contacts, from which there may be a way. The default is first.
+VARIATIONS: tuple[dict[str, float], ...] = (
+    {},
+    {"stability_weight": 2.0},
+    {"direction_weight": 2.0},
+    {"reference_weight": 2.0},
+    {"reference_weight": 0.5},
+)
 Progress = Callable[[str, float, str], None]
 
 
@@ -50,6 +59,7 @@ class Plan:
     Attributes:
         world: Robot and scene.
         sequence: The demonstration in the robot's scene.
+        options: With the weights of the search that got farthest.
         keyframes: The start first; one more after each path.
         paths: Between neighbouring keyframes.
         skipped: Stances left out, and steps for which there is no way.
@@ -97,9 +107,18 @@ def plan(
     clock.lap("retarget")
 
     steps, skipped = split_moves(goal, world)
-    found = plan_steps(
-        ik, steps, options.method, options.keyframe, lap=clock.lap, report=report
-    )
+    found, used = None, options
+    for factors in VARIATIONS:
+        weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
+        varied = replace(options, keyframe=replace(options.keyframe, **weights))
+        trial = plan_steps(
+            ik, steps, varied.method, varied.keyframe, lap=clock.lap, report=report
+        )
+        if found is None or len(trial.missed) < len(found.missed):
+            found, used = trial, varied
+        if not found.missed:
+            break
+    assert found is not None
     trajectory = None
     if found.paths:
         report("trajectory", 1.0, "")
@@ -111,7 +130,7 @@ def plan(
         clock.lap("trajectory")
     return Plan(
         world=world,
-        options=options,
+        options=used,
         sequence=goal,
         keyframes=found.keyframes,
         paths=found.paths,
