@@ -357,3 +357,17 @@ def scaled_coman(folder: Path, scale: float) -> Path:
     fields["gains"] = {"default": {"kp": 600 * gain, "kd": 20 * gain, "ki": 9}}
     (folder / "robot.yaml").write_text(yaml.safe_dump(fields))
     return folder / "robot.yaml"
+
+
+def test_where_a_step_is_missed_other_weights_are_tried(
+    coman, demo_sequence, monkeypatch
+):
+    """Which boxes need it may change with the solver; that it helps may not."""
+    scenes = [at_distance(gap, 0.42) for gap in (0.19, 0.21, 0.215, 0.28)]
+    varied = [plan(demo_sequence, coman, s) for s in scenes]
+    monkeypatch.setattr("clamber.pipeline.VARIATIONS", ({},))
+    once = [plan(demo_sequence, coman, s) for s in scenes]
+    assert all(p.complete for p in varied)
+    assert not all(p.complete for p in once)
+    for a, b in zip(varied, once, strict=True):
+        assert (a.options.keyframe == b.options.keyframe) == b.complete
