@@ -122,7 +122,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     phases = (
         Phase(
             kind="shift",
-            q=_bridge(ik, t.before, t.shifted, closed, before),
+            q=bridge(ik, t.before, t.shifted, closed, before),
             contacts=closed,
             load_before=before,
             load_after=t.held,
@@ -137,7 +137,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
         ),
         Phase(
             kind="settle",
-            q=_bridge(ik, t.touching, t.after, made, made),
+            q=bridge(ik, t.touching, t.after, made, made),
             contacts=made,
             load_before=t.held,
             load_after=made,
@@ -152,7 +152,7 @@ def interpolate(kin: Kinematics, a: np.ndarray, b: np.ndarray, s: float) -> np.n
     return kin.integrate(a, s * kin.difference(a, b))
 
 
-def _bridge(
+def bridge(
     ik: IK,
     a: np.ndarray,
     b: np.ndarray,
@@ -184,7 +184,7 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
     world, kin = ik.world, ik.kin
     made = t.move.makes
     if made is None:
-        return _bridge(ik, t.shifted, t.touching, t.held, t.held), np.zeros((0, 3))
+        return bridge(ik, t.shifted, t.touching, t.held, t.held), np.zeros((0, 3))
     kin.update(t.shifted)
     support = world.supports[made.support]
     p1 = kin.contact_point(made.surface, support.normal)

@@ -6,7 +6,7 @@ sequence -> robot's scale -> moves -> keyframes -> transitions -> paths -> traje
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -15,13 +15,13 @@ import numpy as np
 from clamber.contact import ContactSequence
 from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
-from clamber.moves import Skipped, split_moves
+from clamber.moves import Skipped, Step, split_moves
 from clamber.path import Path, overlap, watched_pairs
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
 from clamber.scene import Scene
-from clamber.search import plan_steps, standing
+from clamber.search import Found, plan_steps, standing
 from clamber.trajectory import Trajectory, build_trajectory
 
 Method = Literal["direct", "lbfgs", "gradient"]
@@ -107,18 +107,7 @@ def plan(
     clock.lap("retarget")
 
     steps, skipped = split_moves(goal, world)
-    found, used = None, options
-    for factors in VARIATIONS:
-        weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
-        varied = replace(options, keyframe=replace(options.keyframe, **weights))
-        trial = plan_steps(
-            ik, steps, varied.method, varied.keyframe, lap=clock.lap, report=report
-        )
-        if found is None or len(trial.missed) < len(found.missed):
-            found, used = trial, varied
-        if not found.missed:
-            break
-    assert found is not None
+    found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
     trajectory = None
     if found.paths:
         report("trajectory", 1.0, "")
@@ -139,6 +128,46 @@ def plan(
         complete=not found.missed and bool(found.paths),
         timings=clock.laps,
     )
+
+
+def search_steps(
+    ik: IK,
+    steps: Sequence[Step],
+    options: PlanOptions,
+    *,
+    start: Keyframe | None = None,
+    lap: Callable[[str], None] = lambda stage: None,
+    report: Progress = lambda stage, share, note: None,
+) -> tuple[Found, PlanOptions]:
+    """What the search finds with the weights that lead it farthest, and those.
+
+    Args:
+        ik: Workspace.
+        steps: To plan, in order.
+        options: Of the plan; `VARIATIONS` of its weights are tried where it is stuck.
+        start: The keyframe to begin from; None: both feet where the robot starts.
+        lap: Called with the stage that has just ended, for timing.
+        report: Called with stage, share and note, for progress.
+    """
+    found, used = None, options
+    for factors in VARIATIONS:
+        weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
+        varied = replace(options, keyframe=replace(options.keyframe, **weights))
+        trial = plan_steps(
+            ik,
+            steps,
+            varied.method,
+            varied.keyframe,
+            lap=lap,
+            report=report,
+            start=start,
+        )
+        if found is None or len(trial.missed) < len(found.missed):
+            found, used = trial, varied
+        if not found.missed:
+            break
+    assert found is not None
+    return found, used
 
 
 class _Clock:

@@ -65,6 +65,7 @@ def plan_steps(
     *,
     lap: Callable[[str], None],
     report: Callable[[str, float, str], None],
+    start: Keyframe | None = None,
 ) -> Found:
     """Plan all steps in order.
 
@@ -75,8 +76,9 @@ def plan_steps(
         options: Of the posture optimisation.
         lap: Called with the stage that has just ended, for timing.
         report: Called with stage, share and note, for progress.
+        start: The keyframe to begin from; None: both feet where the robot starts.
     """
-    keyframes = [standing(ik, options)]
+    keyframes = [standing(ik, options) if start is None else start]
     paths: list[Path] = []
     missed: dict[int, Skipped] = {}  # by step
     steps = list(steps)
