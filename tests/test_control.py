@@ -6,8 +6,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber.control import INTEGRAL_LIMIT, PID
+from clamber.control import INTEGRAL_LIMIT, JointLaw, driven_world
 from clamber.model import PHYSICS_STEP
+
+
+class PID:
+    """The law on the samples of a trajectory."""
+
+    def __init__(self, world, trajectory):
+        self.law, self.world, self.trajectory = JointLaw(world), world, trajectory
+
+    def command(self, k: int, q: np.ndarray) -> np.ndarray:
+        w, t = self.world, self.trajectory
+        return self.law.command(t.q[k, w.qadr], t.v[k, w.dadr], t.tau[k], q)
 
 
 @pytest.fixture
@@ -111,3 +122,70 @@ def test_the_integral_holds_what_feed_forward_does_not_know(demo_plan):
         u = pid.command(0, q)
         q = q + PHYSICS_STEP * (world.kp * (u - q) - load) / damping
     assert np.abs(q - reference)[with_integral].max() < 0.4 * load / world.kp.min()
+
+
+# Mixed control
+
+
+def test_compliant_joints_have_the_impedance_at_their_drives(demo_plan):
+    """(4.31) by MuJoCo itself: stiffness and damping of each joint by differences."""
+    world = driven_world(demo_plan.world, "mixed")
+    soft = world.robot.impedance
+    assert set(soft) == {
+        *("WaistYaw", "WaistLat", "RKneeSag", "LKneeSag", "RElbj", "LElbj")
+    }
+    data = mujoco.MjData(world.model)
+    q = world.home.copy()
+
+    def torque(dq: float, dv: float, joint: int) -> float:
+        data.qpos[:], data.qvel[:] = q, 0.0
+        data.qpos[world.qadr[joint]] += dq
+        data.qvel[world.dadr[joint]] = dv
+        for j, name in enumerate(world.joints):
+            data.ctrl[world.model.actuator(name).id] = q[world.qadr[j]]
+        mujoco.mj_forward(world.model, data)
+        return float(data.qfrc_actuator[world.dadr[joint]])
+
+    for j, name in enumerate(world.joints):
+        kp, kd = soft.get(name, world.robot.gains["default"][:2])
+        assert torque(1e-3, 0.0, j) == pytest.approx(-kp * 1e-3), name
+        assert torque(0.0, 1e-2, j) == pytest.approx(-kd * 1e-2), name
+        assert world.kp[j] == pytest.approx(kp)
+        assert world.ki[j] == (0.0 if name in soft else 9.0)
+
+
+def test_pid_runs_the_planned_world_itself(demo_plan):
+    assert driven_world(demo_plan.world, "pid") is demo_plan.world
+
+
+def test_a_robot_without_impedance_is_driven_as_it_is(demo_plan):
+    from dataclasses import replace
+
+    world = demo_plan.world
+    stiff = replace(world, robot=replace(world.robot, impedance={}))
+    assert driven_world(stiff, "mixed") is stiff
+
+
+def test_only_servos_differ_between_the_worlds_of_the_modes(demo_plan):
+    a, b = demo_plan.world, driven_world(demo_plan.world, "mixed")
+    assert np.array_equal(a.home, b.home)
+    assert np.array_equal(a.model.body_mass, b.model.body_mass)
+    assert np.array_equal(a.model.actuator_forcerange, b.model.actuator_forcerange)
+    assert np.array_equal(a.model.geom_size, b.model.geom_size)
+    assert a.joints == b.joints
+
+
+def test_a_joint_that_positions_itself_is_left_its_feed_forward(demo_plan):
+    """(4.32): the measured angle is the reference, whatever the error has been."""
+    world = demo_plan.world
+    law, n = JointLaw(world), len(world.joints)
+    free = np.zeros(n)
+    free[3] = 1.0
+    q, tau = np.zeros(n), np.full(n, 2.0)
+    for _ in range(500):
+        u = law.command(np.full(n, 0.1), np.full(n, 0.3), tau, q, free)
+    assert world.kp[3] * (u[3] - q[3]) == pytest.approx(2.0)
+    assert np.all(world.kp[:3] * (u[:3] - q[:3]) > 50.0)
+    # The error of that time does not come back when the joint is held again.
+    u = law.command(q, np.zeros(n), tau, q)
+    assert world.kp[3] * (u[3] - q[3]) == pytest.approx(2.0)

@@ -55,7 +55,7 @@ def with_last(rollout, q):
 def test_plain_mujoco_arrives_at_the_same_states_from_the_written_scene(
     demo_plan, demo_rollout
 ):
-    model = mujoco.MjModel.from_xml_string(demo_plan.world.xml)
+    model = mujoco.MjModel.from_xml_string(demo_rollout.world.xml)
     data = mujoco.MjData(model)
     data.qpos[:] = demo_rollout.qpos[0]
     for k, ctrl in enumerate(demo_rollout.ctrl):

@@ -217,7 +217,7 @@ def test_a_run_is_drawn_whole_and_twice_the_same(
     plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
 ):
     io.save_plan(plan, tmp_path)
-    io.save_rollout(rollout, tmp_path)
+    io.save_rollout(plan, rollout, tmp_path)
     told: list[tuple[str, float]] = []
     files = viz.render_run(
         tmp_path,
@@ -302,7 +302,7 @@ def test_without_opengl_plots_are_drawn_and_the_reason_is_one_sentence(
     plan: Plan, rollout: Rollout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     io.save_plan(plan, tmp_path)
-    io.save_rollout(rollout, tmp_path)
+    io.save_rollout(plan, rollout, tmp_path)
     monkeypatch.setattr(viz, "gl_backend", lambda: None)
     with pytest.raises(ClamberError, match="apt-get install libegl1") as e:
         viz.render_run(tmp_path)

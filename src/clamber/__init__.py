@@ -18,6 +18,8 @@ _HOME = {
     "ContactSequence": "contact",
     "Criterion": "simulation",
     "Demonstration": "demo",
+    "Disturbance": "disturbance",
+    "Event": "execution",
     "Infeasible": "errors",
     "InputError": "errors",
     "Kinematics": "model",

@@ -5,11 +5,13 @@ from clamber.contact import Stance as Stance
 from clamber.demo import Demonstration as Demonstration
 from clamber.demo import load_demo as load_demo
 from clamber.detect import detect_contacts as detect_contacts
+from clamber.disturbance import Disturbance as Disturbance
 from clamber.errors import ClamberError as ClamberError
 from clamber.errors import Infeasible as Infeasible
 from clamber.errors import InputError as InputError
 from clamber.errors import MissingDependency as MissingDependency
 from clamber.errors import Status as Status
+from clamber.execution import Event as Event
 from clamber.io import load_plan as load_plan
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder

@@ -35,6 +35,7 @@ from rich.progress import (
 from rich.table import Table
 
 import clamber
+from clamber.disturbance import Disturbance
 from clamber.errors import ClamberError, InputError
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -188,6 +189,34 @@ class PlanningFlags:
     """Largest joint speed."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExecutionFlags:
+    """How to execute, and in which world."""
+
+    controller: Literal["pid", "mixed"] = "mixed"
+    """pid: open loop. mixed: compliant joints, contacts are felt, plans adapted."""
+    disturb: Disturbance = field(default_factory=Disturbance)
+    """What the planner does not know of the true world."""
+
+    def simulate(
+        self, plan: clamber.Plan, folder: Path, report: Report, truth: Path | None
+    ) -> tuple[clamber.Rollout, clamber.Verdict] | None:
+        """Simulate, judge and save; None where there is nothing to simulate."""
+        if plan.trajectory is None:
+            return None
+        rollout = clamber.simulate(
+            plan,
+            controller=self.controller,
+            disturbance=self.disturb,
+            truth=None if truth is None else clamber.load_scene(truth),
+            progress=report,
+        )
+        clamber.save_rollout(plan, rollout, folder)
+        verdict = clamber.judge(plan, rollout)
+        clamber.save_verdict(verdict, folder)
+        return rollout, verdict
+
+
 def _scene(height: float | None, path: Path | None) -> clamber.Scene:
     """The scene of a file, or the one box of `--height`."""
     import pydantic
@@ -214,6 +243,7 @@ class ClimbCommand:
     """A recording, or the built-in demonstration (climb)."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
+    execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: bool = False
     """Draw a video too, not pictures alone."""
     out: Place = None
@@ -234,7 +264,7 @@ class ClimbCommand:
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
-            verdict = _simulate(plan, folder, report)
+            done = self.execution.simulate(plan, folder, report, None)
             missing = ""
             try:
                 clamber.render_run(
@@ -248,7 +278,7 @@ class ClimbCommand:
             _save_timings(folder, clock)
         if missing and not self.output.quiet:
             sys.stderr.write(f"clamber: {missing}\n")
-        return _conclude(self.output, folder, plan, verdict, clock)
+        return _conclude(self.output, folder, plan, done, clock)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,6 +348,9 @@ class SimulateCommand:
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run folder that holds a plan."""
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="TRUTH")] = None
+    """The scene.yaml that physics runs, where it is not the planned one."""
+    execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     output: Printed
 
     def run(self) -> int:
@@ -325,9 +358,11 @@ class SimulateCommand:
         plan = clamber.load_plan(self.run_folder)
         clock = Clock()
         with self.output.progress() as show:
-            verdict = _simulate(plan, self.run_folder, clock.watching(show))
+            done = self.execution.simulate(
+                plan, self.run_folder, clock.watching(show), self.scene
+            )
             _save_timings(self.run_folder, clock)
-        return _conclude(self.output, self.run_folder, plan, verdict)
+        return _conclude(self.output, self.run_folder, plan, done)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -435,19 +470,6 @@ def _plan(
     clamber.save_plan(result, folder)
     report("save", 1.0, "")
     return result
-
-
-def _simulate(
-    plan: clamber.Plan, folder: Path, report: Report
-) -> clamber.Verdict | None:
-    """Simulate, judge and save; None where there is nothing to simulate."""
-    if plan.trajectory is None:
-        return None
-    rollout = clamber.simulate(plan, progress=report)
-    clamber.save_rollout(rollout, folder)
-    verdict = clamber.judge(plan, rollout)
-    clamber.save_verdict(verdict, folder)
-    return verdict
 
 
 def _save_timings(folder: Path, clock: Clock) -> None:
@@ -585,11 +607,12 @@ def _conclude(
     output: Output,
     folder: Path,
     plan: clamber.Plan,
-    verdict: clamber.Verdict | None,
+    done: tuple[clamber.Rollout, clamber.Verdict] | None,
     clock: Clock | None = None,
 ) -> int:
     """Show the verdict and where the files are; the exit code says the same."""
     table = _table("criterion", "value", "limit", "")
+    rollout, verdict = (None, None) if done is None else done
     criteria = {} if verdict is None else verdict.criteria
     for name, c in criteria.items():
         table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
@@ -602,17 +625,26 @@ def _conclude(
             n: {"value": c.value, "limit": c.limit, "ok": c.ok}
             for n, c in criteria.items()
         },
+        "events": [] if rollout is None else [asdict(e) for e in rollout.events],
+        "stopped": "" if rollout is None else rollout.stopped,
         **planned,
     }
     if reached:
         note = "the robot made it"
     elif not plan.complete:
         note = _outcome(plan)
+    elif rollout is not None and rollout.stopped:
+        note = f"the robot stopped on the way: {rollout.stopped}"
     else:
         wrong = [n for n, c in criteria.items() if not c.ok]
         note = f"the robot did not make it ({', '.join(wrong) or 'nothing planned'})"
     tables = [_keyframes(planned)] if clock is not None else []
     tables += _skipped(plan)
+    if rollout is not None and rollout.events:
+        felt = _table("at [s]", "felt on the way")
+        for e in rollout.events:
+            felt.add_row(f"{e.time:.2f}", e.text)
+        tables.append(felt)
     tables += [table] if criteria else []
     output.show(record, *tables, note=f"{note}; the files are in {folder}")
     return REACHED if reached else MISSED

@@ -31,6 +31,7 @@ import pydantic
 import clamber.model
 from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
 from clamber.errors import InputError, Status
+from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
 from clamber.pipeline import Plan, PlanOptions, Skipped
 from clamber.posture.ik import Residuals
@@ -50,8 +51,20 @@ ASSETS = "assets"
 TIMINGS = "timings.json"
 ROLLOUT = "rollout.npz"
 VERDICT = "verdict.json"
+EXECUTION = "execution.json"
+PLANNED_SCENE = "planned.xml"  # where physics ran another world than was planned for
+PLANNED_TRAJECTORY = "planned.npz"  # where another one was followed in the end
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
-_OF_AN_EARLIER_PLAN = (TRAJECTORY, ROLLOUT, VERDICT, TIMINGS)
+_OF_AN_EARLIER_PLAN = (
+    TRAJECTORY,
+    ROLLOUT,
+    VERDICT,
+    TIMINGS,
+    EXECUTION,
+    PLANNED_SCENE,
+    PLANNED_TRAJECTORY,
+)
+_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped"}
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -220,6 +233,9 @@ class _Arrays:
         except _UNREADABLE as e:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else e
             raise InputError(f"a whole .npz file ({reason})", source=path) from e
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._arrays
 
     def get(self, name: str, *shape: int | None) -> np.ndarray:
         """The array; None in a shape fits any length."""
@@ -550,9 +566,7 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
     folder = Path(folder)
     for name in (PLAN, *_OF_AN_EARLIER_PLAN):
         (folder / name).unlink(missing_ok=True)
-    xml = _with_assets(plan.world, folder)
-    with _whole(folder / SCENE) as stream:
-        stream.write(xml.encode())
+    _save_world(plan.world, folder, SCENE)
     if plan.trajectory is not None:
         save_trajectory(plan.trajectory, folder / TRAJECTORY)
     save_timings(folder, plan.timings)
@@ -616,6 +630,11 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
             n: dict(zip(("kp", "kd", "ki"), g, strict=True))
             for n, g in robot.gains.items()
         },
+        "impedance": {
+            n: dict(zip(("kp", "kd"), g, strict=True))
+            for n, g in robot.impedance.items()
+        },
+        "self_positioning": robot.self_positioning,
     }
 
 
@@ -652,6 +671,12 @@ def _keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
         "cost_after": k.cost_after,
         "status": k.status.name,
     }
+
+
+def _save_world(world: World, folder: Path, name: str) -> None:
+    xml = _with_assets(world, folder)
+    with _whole(folder / name) as stream:
+        stream.write(xml.encode())
 
 
 def _with_assets(world: World, folder: Path) -> str:
@@ -693,7 +718,7 @@ def _with_assets(world: World, folder: Path) -> str:
 def load_plan(folder: str | Path) -> Plan:
     """Read what `save_plan` wrote, all but the paths.
 
-    The world is that of `scene.xml`: what a rollout is checked against.
+    World and trajectory are the planned ones, whatever a run has made of them since.
 
     Raises:
         InputError: A file is missing, broken, or does not fit the others.
@@ -708,7 +733,8 @@ def load_plan(folder: str | Path) -> Plan:
     except pydantic.ValidationError as e:
         raise input_error(e, path) from e
     sequence = file.sequence.sequence(path)
-    world = _load_world(folder / SCENE, _robot(file.robot), sequence.scene)
+    scene, followed = _planned(folder)
+    world = _load_world(scene, _robot(file.robot), sequence.scene)
     nq = world.model.nq
     for i, k in enumerate(file.keyframes):
         if len(k.qpos) != nq:
@@ -728,8 +754,8 @@ def load_plan(folder: str | Path) -> Plan:
                     value=f"{c.surface} on {c.support}",
                 )
     trajectory = None
-    if (folder / TRAJECTORY).exists() or file.complete:
-        trajectory = load_trajectory(folder / TRAJECTORY, world)
+    if followed.exists() or file.complete:
+        trajectory = load_trajectory(followed, world)
     timings: dict[str, float] = {}
     if (folder / TIMINGS).exists():
         timings = _read_json(folder / TIMINGS, _TimingsFile).seconds
@@ -743,6 +769,15 @@ def load_plan(folder: str | Path) -> Plan:
         trajectory=trajectory,
         complete=file.complete,
         timings=timings,
+    )
+
+
+def _planned(folder: Path) -> tuple[Path, Path]:
+    """Scene and trajectory as planned: a run may have put others in their place."""
+    scene, trajectory = folder / PLANNED_SCENE, folder / PLANNED_TRAJECTORY
+    return (
+        scene if scene.exists() else folder / SCENE,
+        trajectory if trajectory.exists() else folder / TRAJECTORY,
     )
 
 
@@ -765,6 +800,8 @@ def _robot(file: RobotFile) -> Robot:
         },
         prefixes=file.surfaces,
         gains={n: (g.kp, g.kd, g.ki) for n, g in file.gains.items()},
+        impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
+        self_positioning=tuple(file.self_positioning),
     )
 
 
@@ -853,29 +890,57 @@ def _sha256(content: bytes) -> str:
 # Rollouts and verdicts.
 
 
-def save_rollout(rollout: Rollout, folder: str | Path) -> None:
-    """Write `rollout.npz`: every field of the record by its name.
+def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
+    """Write what physics did, and what it ran.
 
-    A dictionary of numbers becomes two arrays, the second one `<name>_keys`.
+    `rollout.npz` has the arrays by name (a dictionary of numbers becomes two arrays,
+    the second one `<name>_keys`), `execution.json` what was felt. `scene.xml` and
+    `trajectory.npz` become what physics ran and what was last followed; where those are
+    not the planned ones, the planned ones are kept as `planned.xml`, `planned.npz`.
     """
+    folder = Path(folder)
+    same_world = rollout.world.xml == plan.world.xml
+    assert plan.trajectory is not None
+    if not same_world:
+        _save_world(plan.world, folder, PLANNED_SCENE)
+    _save_world(rollout.world, folder, SCENE)
+    if rollout.followed is not None:
+        save_trajectory(plan.trajectory, folder / PLANNED_TRAJECTORY)
+    save_trajectory(rollout.followed or plan.trajectory, folder / TRAJECTORY)
+    if same_world:
+        (folder / PLANNED_SCENE).unlink(missing_ok=True)
+    if rollout.followed is None:
+        (folder / PLANNED_TRAJECTORY).unlink(missing_ok=True)
     arrays: dict[str, Any] = {}
     for field in fields(rollout):
         value = getattr(rollout, field.name)
+        if field.name in _NOT_IN_ROLLOUT or value is None:
+            continue
         if isinstance(value, dict):
             arrays[field.name] = np.array([*value.values()], dtype=float)
             arrays[f"{field.name}_keys"] = np.array([*value], dtype=str)
         else:
             arrays[field.name] = value
-    _write_npz(Path(folder) / ROLLOUT, arrays)
+    _write_npz(folder / ROLLOUT, arrays)
+    _write_json(
+        folder / EXECUTION,
+        {
+            "scene": scene_fields(rollout.world.scene),
+            "events": [asdict(e) for e in rollout.events],
+            "fell": rollout.fell,
+            "stopped": rollout.stopped,
+        },
+    )
 
 
 def load_rollout(folder: str | Path) -> Rollout:
-    """Read the `rollout.npz` of a run folder.
+    """Read what `save_rollout` wrote.
 
     Raises:
-        InputError: It is missing or broken.
+        InputError: A file is missing or broken.
     """
-    f = _Arrays(Path(folder) / ROLLOUT)
+    folder = Path(folder)
+    f = _Arrays(folder / ROLLOUT)
     steps, states = len(f.get("ctrl", None, None)), len(f.get("time", None))
     nu, ns = f.get("ctrl", None, None).shape[1], len(f.get("surfaces", None))
     shapes: dict[str, tuple[int | None, ...]] = {
@@ -888,6 +953,8 @@ def load_rollout(folder: str | Path) -> Rollout:
     }
     values: dict[str, Any] = {}
     for name, kind in get_type_hints(Rollout).items():
+        if name in _NOT_IN_ROLLOUT or name == "push":
+            continue
         if kind is np.ndarray:
             shape = shapes.get(name, (states,))
             values[name] = f.get(name, *shape)
@@ -901,7 +968,34 @@ def load_rollout(folder: str | Path) -> Rollout:
             )
         else:
             values[name] = kind(f.get(name).item())
-    return Rollout(**values)
+    if "push" in f:
+        values["push"] = f.get("push", steps, 3)
+    file = _read_json(folder / EXECUTION, _ExecutionFile)
+    robot = _robot(_read_json(folder / PLAN, _PlanFile).robot)
+    world = _load_world(folder / SCENE, robot, file.scene.scene())
+    followed = None
+    if (folder / PLANNED_TRAJECTORY).exists():
+        followed = load_trajectory(folder / TRAJECTORY, world)
+    return Rollout(
+        **values,
+        world=world,
+        followed=followed,
+        events=tuple(Event(time=e.time, text=e.text) for e in file.events),
+        fell=file.fell,
+        stopped=file.stopped,
+    )
+
+
+class _EventFile(pydantic.BaseModel):
+    time: float
+    text: str
+
+
+class _ExecutionFile(pydantic.BaseModel):
+    scene: _SceneFile
+    events: list[_EventFile]
+    fell: bool
+    stopped: str
 
 
 class _CriterionFile(pydantic.BaseModel):

@@ -12,8 +12,9 @@ are the floating base.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import mujoco
@@ -54,6 +55,13 @@ class GainsFile(_Strict):
     ki: float = pydantic.Field(default=9.0, ge=0)
 
 
+class ImpedanceFile(_Strict):
+    """Stiffness and damping of a compliant joint: [N m/rad], [N m s/rad]."""
+
+    kp: float = pydantic.Field(gt=0)
+    kd: float = pydantic.Field(ge=0)
+
+
 class RobotFile(_Strict):
     """A robot as a person writes it (`robot.yaml`)."""
 
@@ -65,6 +73,8 @@ class RobotFile(_Strict):
     limbs: dict[Literal["left_arm", "right_arm", "left_leg", "right_leg"], LimbFile]
     surfaces: dict[str, str] = {}
     gains: dict[str, GainsFile] = {"default": GainsFile()}
+    impedance: dict[str, ImpedanceFile] = {}
+    self_positioning: list[str] = []
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -94,6 +104,9 @@ class Robot:
         limbs: By name, from `LIMBS`.
         prefixes: Prefix of the geom names of each surface.
         gains: (kp, kd, ki) by joint name, and `default`.
+        impedance: (kp, kd) of the joints that mixed control makes compliant (4.31).
+        self_positioning: Joints that follow their terrain while the arms bear load
+            (4.32): the ankles.
     """
 
     name: str
@@ -103,6 +116,10 @@ class Robot:
     limbs: Mapping[str, Limb]
     prefixes: Mapping[str, str]
     gains: Mapping[str, tuple[float, float, float]]
+    impedance: Mapping[str, tuple[float, float]] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
+    self_positioning: tuple[str, ...] = ()
 
     @property
     def surfaces(self) -> tuple[str, ...]:
@@ -171,6 +188,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
             s: file.surfaces.get(s, s) for limb in limbs.values() for s in limb.surfaces
         },
         gains={n: (g.kp, g.kd, g.ki) for n, g in gains.items()},
+        impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
+        self_positioning=tuple(file.self_positioning),
     )
     _check(robot, path)
     return robot
@@ -192,19 +211,28 @@ def _check(robot: Robot, source: Path) -> None:
             field="base",
             value=robot.base,
         )
-    for name in robot.home:
-        if name not in joints:
-            raise InputError(
-                f"a joint of {robot.path.name}", source=source, field="home", value=name
-            )
+    named = {
+        "home": robot.home,
+        "impedance": robot.impedance,
+        "self_positioning": robot.self_positioning,
+    }
+    for where, names in named.items():
+        for name in names:
+            if name not in joints:
+                raise InputError(
+                    f"a joint of {robot.path.name}",
+                    source=source,
+                    field=where,
+                    value=name,
+                )
     for limb in robot.limbs.values():
-        for field in ("root", "middle", "end"):
-            if getattr(limb, field) not in bodies | geoms | set(robot.surfaces):
+        for place in ("root", "middle", "end"):
+            if getattr(limb, place) not in bodies | geoms | set(robot.surfaces):
                 raise InputError(
                     f"a body or geom of {robot.path.name}",
                     source=source,
-                    field=f"limbs.{limb.name}.{field}",
-                    value=getattr(limb, field),
+                    field=f"limbs.{limb.name}.{place}",
+                    value=getattr(limb, place),
                 )
         for s in limb.surfaces:
             if not any(_bears(g, robot.prefixes[s]) for g in geoms):
@@ -275,6 +303,8 @@ class World:
         tau_max: (na,) effort limits; joints: (na,) names.
         qadr, dadr: (na,) indices of the actuated joints in q and v.
         pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
+        support_geom: Geom of each support; support_of_geom: the other way, with the
+            tiles of an uneven top.
     """
 
     model: mujoco.MjModel
@@ -297,6 +327,7 @@ class World:
     ki: np.ndarray
     pairs: np.ndarray
     support_geom: Mapping[str, int]
+    support_of_geom: Mapping[int, str]
     supports: Mapping[str, Support]
     base: int
     mass: float
@@ -476,6 +507,13 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         ki=gains[:, 2],
         pairs=_pairs(model, data, base),
         support_geom={s.name: model.geom(s.name).id for s in scene.supports},
+        support_of_geom={
+            g: s.name
+            for s in scene.supports
+            for g in range(model.ngeom)
+            if model.geom_bodyid[g] == 0
+            and (model.geom(g).name == s.name or _bears(model.geom(g).name, s.name))
+        },
         supports={s.name: s for s in scene.supports},
         base=base,
         mass=float(model.body_subtreemass[base]),

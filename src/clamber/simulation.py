@@ -12,10 +12,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from clamber.control import PID
+from clamber.control import ControlMode, driven_world
+from clamber.disturbance import Disturbance, disturbed_world, push_of
+from clamber.execution import Event, Execution, Tracking
 from clamber.model import PHYSICS_STEP, World
 from clamber.pipeline import Plan
-from clamber.scene import GROUND
+from clamber.scene import GROUND, Scene
+from clamber.sensing import Sensors
 from clamber.trajectory import Trajectory
 
 STRIDE = 10  # physics steps between two recorded states
@@ -28,6 +31,9 @@ SHARE_ON_PLAN = 0.97  # of the weight, at the end, on the surfaces planned
 OVERLAP_TOL = 0.010  # [m] of the robot with itself or with the scene
 GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
 YAW_TOL = np.radians(15.0)
+FALLEN_TILT = np.radians(45.0)  # pelvis against its reference: it has fallen
+FALLEN_HEIGHT = 0.20  # [m]
+DEFAULT_CONTROLLER: ControlMode = "mixed"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -49,8 +55,15 @@ class Rollout:
         self_overlap: Deepest overlap of the robot with itself [m]; self_pair: where.
         unintended_parts: The same share by part.
         end_speed: Largest pelvis speed over the last second [m/s].
+        world: The one that physics ran.
+        push: (N, 3) force on the pelvis [N], in the world; None where nothing pushed.
+        followed: What was last followed, where that is not the plan.
+        events: What was felt on the way, and what was done about it.
+        fell: The run ended at once because the robot fell.
+        stopped: Why the robot stopped in a stance on the way; empty where it did not.
     """
 
+    world: World
     ctrl: np.ndarray
     stride: int
     time: np.ndarray
@@ -67,6 +80,11 @@ class Rollout:
     unintended_share: float
     unintended_parts: dict[str, float]
     end_speed: float
+    push: np.ndarray | None = None
+    followed: Trajectory | None = None
+    events: tuple[Event, ...] = ()
+    fell: bool = False
+    stopped: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -87,70 +105,102 @@ class Verdict:
 
 
 def simulate(
-    plan: Plan, *, progress: Callable[[str, float, str], None] | None = None
+    plan: Plan,
+    *,
+    controller: ControlMode = DEFAULT_CONTROLLER,
+    disturbance: Disturbance | None = None,
+    truth: Scene | None = None,
+    progress: Callable[[str, float, str], None] | None = None,
 ) -> Rollout:
-    """Run the trajectory of a plan in MuJoCo under joint PID.
+    """Run the trajectory of a plan in MuJoCo.
+
+    Args:
+        plan: What to do.
+        controller: `pid` follows the trajectory open loop, PID on every joint; `mixed`
+            makes some joints compliant and feels its contacts (`execution`).
+        disturbance: How the true world differs from the planned one, and how well it
+            is sensed.
+        truth: The true scene, where it is not the planned one.
+        progress: Called with stage, share and note.
 
     Raises:
         ValueError: The plan has no trajectory.
     """
     if plan.trajectory is None:
         raise ValueError("the plan has no trajectory")
-    return _run(
-        plan.world, plan.trajectory, progress or (lambda stage, share, note: None)
+    d = disturbance or Disturbance()
+    world = driven_world(disturbed_world(plan.world, d, truth), controller)
+    pilot = (Tracking if controller == "pid" else Execution)(plan, world)
+    sensors = Sensors(
+        world, noise=d.noise, delay=d.delay, rng=np.random.default_rng([d.seed, 1])
     )
+    push = push_of(d, float(plan.trajectory.time[-1]))
+    report = progress or (lambda stage, share, note: None)
+    return _run(world, pilot, sensors, push, len(plan.trajectory.time), report)
 
 
 def _run(
-    world: World, trajectory: Trajectory, report: Callable[[str, float, str], None]
+    world: World,
+    pilot: Tracking | Execution,
+    sensors: Sensors,
+    push: np.ndarray | None,
+    planned: int,
+    report: Callable[[str, float, str], None],
 ) -> Rollout:
     model = world.model
     data = mujoco.MjData(model)
-    data.qpos[:] = trajectory.q[0]
-    controller = PID(world, trajectory)
-    n = len(trajectory.time)
-    m = -(-n // STRIDE)
+    data.qpos[:] = world.home
     surfaces = tuple(world.surfaces)
     meter = _ContactMeter(world, surfaces)
-    ctrl = np.zeros((n, model.nu))
-    qpos, qvel = np.zeros((m, model.nq)), np.zeros((m, model.nv))
-    effort = np.zeros((m, model.nu))
-    force, unintended = np.zeros((m, len(surfaces), 3)), np.zeros(m)
+    ctrl, qpos, qvel, effort, force, unintended = [], [], [], [], [], []
     overlap = speed = 0.0
-    tail = n - round(SETTLE / PHYSICS_STEP)
+    tail = round(SETTLE / PHYSICS_STEP)
     order = [model.actuator(j).id for j in world.joints]
-    for k in range(n):
-        row, first = divmod(k, STRIDE)
-        if first == 0:
-            qpos[row], qvel[row] = data.qpos, data.qvel
-        ctrl[k, order] = controller.command(k, data.qpos[world.qadr])
-        data.ctrl[:] = ctrl[k]
+    fell, k = False, 0
+    while not fell:
+        first = k % STRIDE == 0
+        if first:
+            qpos.append(data.qpos.copy())
+            qvel.append(data.qvel.copy())
+        row = np.zeros(model.nu)
+        row[order] = pilot.command(sensors.read(data))
+        ctrl.append(row)
+        data.ctrl[:] = row
+        if push is not None:
+            data.xfrc_applied[world.base, :3] = push[k] if k < len(push) else 0.0
         mujoco.mj_step(model, data)
+        end = pilot.left < tail
         if data.ncon:
             overlap = max(overlap, -float(data.contact.dist.min()))
-        if k >= tail:
+        if end:
             speed = max(speed, float(np.linalg.norm(data.qvel[:3])))
-        if first == 0 or k >= tail:
-            forces, other = meter.measure(data, end=k >= tail, total=first == 0)
-            if first == 0:
-                effort[row] = data.actuator_force
-                force[row], unintended[row] = forces, other
+        if first or end:
+            forces, other = meter.measure(data, end=end, total=first)
+            if first:
+                effort.append(data.actuator_force.copy())
+                force.append(forces)
+                unintended.append(other)
+                fell = has_fallen(data.qpos, pilot.reference)
         if k % 1000 == 0:
-            report(
-                "simulate", k / n, f"{k * PHYSICS_STEP:.0f} of {n * PHYSICS_STEP:.0f} s"
-            )
+            share = min(k / max(planned, k + pilot.left), 1.0)
+            report("simulate", share, f"{k * PHYSICS_STEP:.0f} s")
+        k += 1
+        if pilot.left == 0:
+            break
     report("simulate", 1.0, "")
-    self_overlap, pair = deepest_self_overlap(world, qpos)
-    weight = world.mass * 9.81 * (n - tail)
+    states = np.array(qpos)
+    self_overlap, pair = deepest_self_overlap(world, states)
+    weight = world.mass * 9.81 * min(tail, k)
     return Rollout(
-        ctrl=ctrl,
+        world=world,
+        ctrl=np.array(ctrl),
         stride=STRIDE,
-        time=np.arange(m) * STRIDE * PHYSICS_STEP,
-        qpos=qpos,
-        qvel=qvel,
-        actuator_force=effort,
-        contact_force=force,
-        unintended=unintended,
+        time=np.arange(len(states)) * STRIDE * PHYSICS_STEP,
+        qpos=states,
+        qvel=np.array(qvel),
+        actuator_force=np.array(effort),
+        contact_force=np.array(force),
+        unintended=np.array(unintended),
         surfaces=surfaces,
         overlap=overlap,
         self_overlap=self_overlap,
@@ -161,7 +211,25 @@ def _run(
             k: v / max(meter.total, 1e-9) for k, v in sorted(meter.parts.items())
         },
         end_speed=speed,
+        push=None if push is None else _padded(push, k),
+        followed=pilot.followed,
+        events=tuple(pilot.events),
+        fell=fell,
+        stopped=pilot.stopped,
     )
+
+
+def has_fallen(q: np.ndarray, reference: np.ndarray) -> bool:
+    """The pelvis has tilted or sunk far from its reference: the run need not go on."""
+    tilt = np.arccos(np.clip(_up(q[3:7]) @ _up(reference[3:7]), -1.0, 1.0))
+    return bool(tilt > FALLEN_TILT or q[2] < reference[2] - FALLEN_HEIGHT)
+
+
+def _padded(x: np.ndarray, n: int) -> np.ndarray:
+    """The first `n` rows, zeros where there are fewer."""
+    out = np.zeros((n, *x.shape[1:]))
+    out[: min(n, len(x))] = x[:n]
+    return out
 
 
 class _ContactMeter:
@@ -174,6 +242,7 @@ class _ContactMeter:
         for i, s in enumerate(surfaces):
             self.row[list(world.surfaces[s].geoms)] = i
         self.surfaces = surfaces
+        self.support_of = world.support_of_geom
         self.env = m.body_weldid[m.geom_bodyid] == 0
         self.end: dict[str, float] = {}
         self.parts: dict[str, float] = {}
@@ -206,7 +275,7 @@ class _ContactMeter:
                     self.parts[part] = self.parts.get(part, 0.0) + self._force[0]
             if end:
                 name = self.surfaces[row] if row >= 0 else "other"
-                key = f"{name}@{self.model.geom(support).name}"
+                key = f"{name}@{self.support_of[support]}"
                 self.end[key] = self.end.get(key, 0.0) + float(world_force[2])
         return forces, other
 
@@ -237,18 +306,21 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     """Did the robot end where the plan says, on what it planned to rest on?"""
     assert plan.trajectory is not None
     world = plan.world
-    planned, last = plan.trajectory.q[-1], rollout.qpos[-1]
+    followed = rollout.followed or plan.trajectory
+    planned, last = followed.q[-1], rollout.qpos[-1]
     final = plan.keyframes[-1].stance
     on_plan = sum(rollout.end_share.get(f"{c.surface}@{c.support}", 0.0) for c in final)
     on_ground = sum(v for k, v in rollout.end_share.items() if k.endswith("@" + GROUND))
     on_boxes = sum(rollout.end_share.values()) - on_ground
     up, up_planned = (_up(q[3:7]) for q in (last, planned))
     tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
-    tops = [world.supports[c.support].position[2] for c in final]
+    tops = [rollout.world.supports[c.support].position[2] for c in final]
     order = [world.model.actuator(j).id for j in world.joints]
-    share = np.abs(rollout.actuator_force[:, order]) / world.tau_max
+    share = np.abs(rollout.actuator_force[:, order]) / rollout.world.tau_max
     effort = float(share.max(initial=0.0))
     goal = {
+        "did not fall": _at_least(float(not rollout.fell), 1.0),
+        "did not stop on the way": _at_least(float(not rollout.stopped), 1.0),
         "planned to the last stance": _at_least(float(plan.complete), 1.0),
         "share of the weight at the end on planned contacts": _at_least(
             on_plan, SHARE_ON_PLAN

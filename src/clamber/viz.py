@@ -433,9 +433,9 @@ def climb_sheet(
 ) -> Path:
     """Draw what physics did, in pictures evenly spaced in time."""
     rows = np.linspace(0, len(rollout.time) - 1, frames).round().astype(int)
-    view = view_of(plan.world, _some(rollout.qpos, 60), tile[0] / tile[1])
+    view = view_of(rollout.world, _some(rollout.qpos, 60), tile[0] / tile[1])
     tiles = []
-    with Camera(plan.world, tile) as camera:
+    with Camera(rollout.world, tile) as camera:
         for row in rows:
             picture = camera.shot(rollout.qpos[row], view)
             tiles.append((picture, [f"{rollout.time[row]:.1f} s"]))
@@ -742,8 +742,8 @@ def _frames(
         size[0] * 5 // 4,
         size[1] * 5 // 4,
     )  # smoother edges at a third of the price
-    view = view_of(plan.world, _some(rollout.qpos, 60), size[0] / size[1])
-    with Camera(plan.world, drawn, smooth=False) as camera:
+    view = view_of(rollout.world, _some(rollout.qpos, 60), size[0] / size[1])
+    with Camera(rollout.world, drawn, smooth=False) as camera:
         for i, (row, t) in enumerate(zip(rows, times, strict=True)):
             if i % 10 == 0:
                 report("video", i / len(rows), "")
