@@ -92,9 +92,12 @@ def demo_plan(demo_sequence, coman):
 
 @pytest.fixture(scope="session")
 def demo_rollout(demo_plan):
+    """Open loop, by sensors that know everything."""
+    from clamber.disturbance import Disturbance
     from clamber.simulation import simulate
 
-    return simulate(demo_plan)
+    exact = Disturbance(noise=0.0, delay=0.0)
+    return simulate(demo_plan, controller="pid", disturbance=exact)
 
 
 @pytest.fixture(scope="session")

@@ -26,6 +26,7 @@ LAYERS = [
     "contact",
     "model",
     "disturbance",
+    "truth",
     "sensing",
     "statics",
     "demo",

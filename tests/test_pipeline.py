@@ -217,7 +217,7 @@ def climb(sequence, robot, height, folder, **options):
     assert result.complete, [s.reason for s in result.skipped]
     rollout = simulate(result)
     save_plan(result, folder)
-    save_rollout(rollout, folder)
+    save_rollout(result, rollout, folder)
     return result, rollout
 
 
@@ -270,7 +270,7 @@ def test_the_judge_refuses_runs_that_were_tampered_with(
     save_plan(demo_plan, tmp_path)
 
     def verdict(**changes) -> dict:
-        save_rollout(replace(demo_rollout, **changes), tmp_path)
+        save_rollout(demo_plan, replace(demo_rollout, **changes), tmp_path)
         return refused(ask_judge(tmp_path, 0.275))
 
     assert verdict() == {}
@@ -284,7 +284,7 @@ def test_the_judge_refuses_runs_that_were_tampered_with(
     half = {k: getattr(demo_rollout, k)[:n] for k in ("time", "qpos", "qvel")}
     names = verdict(ctrl=demo_rollout.ctrl[: n * demo_rollout.stride], **half)
     assert "share of the weight on obstacles at the end" in names
-    save_rollout(demo_rollout, tmp_path)
+    save_rollout(demo_plan, demo_rollout, tmp_path)
     assert "the boxes are those asked for" in refused(ask_judge(tmp_path, 0.31))
     scene = tmp_path / "scene.xml"
     light = scene.read_text().replace("<option ", '<option gravity="0 0 -8.81" ', 1)

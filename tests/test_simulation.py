@@ -209,7 +209,7 @@ def test_deepest_self_overlap_is_what_mujoco_measures(demo_plan):
 def test_physics_decides_a_box_lower_than_the_plan_believes(demo_plan):
     world = build_world(demo_plan.world.robot, Scene.from_height(0.18))
     believer = replace(demo_plan, world=world)
-    assert not judge(believer, simulate(believer)).reached
+    assert not judge(believer, simulate(believer, controller="pid")).reached
 
 
 # The verdict.

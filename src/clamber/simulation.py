@@ -13,13 +13,14 @@ import mujoco
 import numpy as np
 
 from clamber.control import ControlMode, driven_world
-from clamber.disturbance import Disturbance, disturbed_world, push_of
+from clamber.disturbance import Disturbance
 from clamber.execution import Event, Execution, Tracking
 from clamber.model import PHYSICS_STEP, World
 from clamber.pipeline import Plan
 from clamber.scene import GROUND, Scene
 from clamber.sensing import Sensors
 from clamber.trajectory import Trajectory
+from clamber.truth import disturbed_world, push_of
 
 STRIDE = 10  # physics steps between two recorded states
 SETTLE = 1.0  # [s] the end must hold this long
