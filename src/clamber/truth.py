@@ -64,7 +64,7 @@ def disturbed_scene(scene: Scene, d: Disturbance) -> Scene:
     """The scene with other heights, tilts, friction and start; tiles aside."""
     boxes = []
     for b in scene.boxes:
-        size = b.size + [0.0, 0.0, d.height]
+        size = b.size + np.array([0.0, 0.0, d.height])
         if size[2] <= 0.01:
             raise InputError(
                 f"a box higher than 0.01 m ({b.name} is {b.size[2]:g} m high)",
