@@ -37,6 +37,7 @@ LAYERS = [
     "transition",
     "path",
     "search",
+    "retiming",
     "trajectory",
     "pipeline",
     "control",

@@ -183,10 +183,10 @@ class PlanningFlags:
         "pipeline", "PlanOptions", "method"
     )
     """How contact positions are optimised."""
-    speed: Annotated[float, tyro.conf.arg(metavar="RAD/S")] = _default(
-        "pipeline", "PlanOptions", "speed"
+    speed: Annotated[float | Literal["max"], tyro.conf.arg(metavar="RAD/S|max")] = (
+        _default("pipeline", "PlanOptions", "speed")
     )
-    """Largest joint speed."""
+    """Largest joint speed; max: as fast as joints and contacts bear."""
 
 
 @dataclass(frozen=True, kw_only=True)

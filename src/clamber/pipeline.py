@@ -43,12 +43,13 @@ class PlanOptions:
 
     Attributes:
         method: How contact positions are optimised.
-        speed: Largest joint speed [rad/s]; the thesis used 0.05.
+        speed: Largest joint speed [rad/s], the thesis used 0.05; `max`: as fast as
+            joints and contacts bear.
         keyframe: Options of the posture optimisation.
     """
 
     method: Method = "direct"
-    speed: float = 0.3
+    speed: float | Literal["max"] = 0.3
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 
 
@@ -94,9 +95,9 @@ def plan(
     """
     options = options or PlanOptions()
     report = progress or (lambda stage, share, note: None)
-    if not options.speed > 0:
+    if options.speed != "max" and not options.speed > 0:
         raise InputError(
-            "a positive joint speed [rad/s]", field="speed", value=options.speed
+            "a positive joint speed [rad/s], or max", field="speed", value=options.speed
         )
     clock = _Clock()
     world = build_world(robot, scene)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
@@ -23,11 +24,13 @@ from clamber.contact import Contact
 from clamber.model import Kinematics, World
 from clamber.path import Phase
 from clamber.posture.keyframe import bearing_frames
+from clamber.retiming import GRID, demand_at, least_torques, retime
 from clamber.se3 import quat_conjugate, quat_multiply
 from clamber.statics import com_margin, contact_forces, support_polygon
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
+TOUCH_REST, MIN_REST = 0.08, 0.02  # [s] ... of a fast motion: after a touch, elsewhere
 HOLD_START = 0.3  # [s]
 HOLD_END = 2.0  # [s] the last posture is held
 ACCELERATION = 4.0  # [1/s] the cruise speed is reached after a quarter of a second
@@ -38,6 +41,7 @@ BALANCE_SAMPLES = 24  # of the centre of mass along a phase
 BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
 SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
 GRAVITY = 9.81  # [m/s^2]
+TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
 
 
@@ -164,6 +168,8 @@ def _spline(kin: Kinematics, phase: Phase, speed: float, v_max: np.ndarray) -> _
     slope[:, :3] /= BASE_LENGTH
     limit = np.minimum(speed, v_max)
     cruise = float((limit / np.maximum(slope.max(axis=0), 1e-9)).min())
+    if not np.isfinite(cruise):
+        return _Spline(curve, tau, float(s[-1]), cruise)
     cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
     return _Spline(curve, tau, float(s[-1]), cruise)
 
@@ -248,11 +254,61 @@ def _profile(length: float, cruise: float) -> np.ndarray:
     return np.stack([s * scale, rate * scale], axis=1)
 
 
+def _made(phases: Sequence[Phase], i: int) -> Contact | None:
+    """The contact that is made at the end of a phase, if any."""
+    if i + 1 == len(phases):
+        return None
+    before = {(c.surface, c.support) for c in phases[i].contacts}
+    after = phases[i + 1].contacts
+    return next((c for c in after if (c.surface, c.support) not in before), None)
+
+
+def _fastest(
+    kin: Kinematics, phase: Phase, spline: _Spline, made: Contact | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """s, ds/dt (n,) and torques (n, na) of the fastest motion along a phase."""
+    grid = np.linspace(0.0, spline.length, GRID)
+    q, slope = _on_manifold(spline.curve(grid), spline.curve(grid, 1))
+    s, rate = retime(
+        kin, grid, q, slope, _bend(spline.curve, grid), phase.contacts, made
+    )
+    change = np.gradient(rate, 1.0 / RATE) if len(rate) > 1 else np.zeros(1)
+    look = np.unique([*range(0, len(s), TORQUE_STRIDE), len(s) - 1])
+    raw = spline.curve(s[look])
+    q, slope = _on_manifold(raw, spline.curve(s[look], 1))
+    bend = _bend(spline.curve, s[look])
+    tau = []
+    for i, k in enumerate(look):
+        ends = [
+            least_torques(
+                kin,
+                demand_at(kin, q[i], slope[i], bend[i], load),
+                float(change[k]),
+                float(rate[k] ** 2),
+            )
+            for load in (phase.load_before, phase.load_after)
+        ]
+        share = s[k] / spline.length
+        tau.append((1.0 - share) * ends[0] + share * ends[1])
+    return s, rate, make_interp_spline(look, np.array(tau), k=1)(np.arange(len(s)))
+
+
+def _bend(curve: CubicSpline, s: np.ndarray) -> np.ndarray:
+    """(n, nv) derivative of the tangent vector along the path."""
+    raw, slope, bend = curve(s), curve(s, 1), curve(s, 2)
+    norm = np.sum(raw[:, 3:7] ** 2, axis=1, keepdims=True)
+    inverse = quat_conjugate(raw[:, 3:7])
+    omega = 2.0 * quat_multiply(inverse, slope[:, 3:7])[:, 1:] / norm
+    stretch = 2.0 * np.sum(raw[:, 3:7] * slope[:, 3:7], axis=1, keepdims=True) / norm
+    turn = 2.0 * quat_multiply(inverse, bend[:, 3:7])[:, 1:] / norm - stretch * omega
+    return np.concatenate([bend[:, :3], turn, bend[:, 7:]], axis=1)
+
+
 def build_trajectory(
     world: World,
     phases: Sequence[Phase],
     *,
-    speed: float,
+    speed: float | Literal["max"],
     keyframe_after: Sequence[int] = (),
 ) -> Trajectory:
     """Time the phases one after the other.
@@ -260,7 +316,7 @@ def build_trajectory(
     Args:
         world: Robot and scene.
         phases: In order; each begins with the last posture of the one before.
-        speed: Largest joint speed [rad/s].
+        speed: Largest joint speed [rad/s]; `max`: as fast as joints and contacts bear.
         keyframe_after: Index of the phase at whose end each keyframe is reached.
 
     Raises:
@@ -286,18 +342,25 @@ def build_trajectory(
             raise ValueError(
                 f"phase {i} ({phase.kind}) does not begin where the last one ended"
             )
-        spline = _spline(kin, phase, speed, world.v_max)
+        cruise = np.inf if speed == "max" else speed
+        spline = _spline(kin, phase, cruise, world.v_max)
         if i == 0:
             first, _ = spline.sample(np.zeros(1), np.zeros(1))
             hold(HOLD_START, phase, first[0], spline.tau(0.0))
-        s, rate = _profile(spline.length, spline.cruise).T
+        if speed == "max":
+            made = _made(phases, i)
+            s, rate, torque = _fastest(kin, phase, spline, made)
+            rest = TOUCH_REST if made else MIN_REST
+        else:
+            s, rate = _profile(spline.length, spline.cruise).T
+            torque, rest = spline.tau(s), REST
         qs, vs = spline.sample(s, rate)
         q.append(qs)
         v.append(vs)
-        tau.append(spline.tau(s))
+        tau.append(torque)
         closed = {c.surface for c in phase.contacts}
         contact.append(np.tile([x in closed for x in surfaces], (len(s), 1)))
-        hold(HOLD_END if i == len(phases) - 1 else REST, phase, qs[-1], tau[-1][-1])
+        hold(HOLD_END if i == len(phases) - 1 else rest, phase, qs[-1], tau[-1][-1])
         samples = sum(map(len, q))
         ends.append(samples - 1)
     n = samples
