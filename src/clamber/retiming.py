@@ -38,10 +38,9 @@ GRID = 32  # points of a path
 STEP = 0.001  # [s]
 _RANK = 1e-4  # of a regularisation against a direction of length one
 _SLACK = 1e8  # of an unbalanced force against a contact force, squared
-# Directions in (u, x), each in units of its bound, in which polygons are explored. The
-# outer ones point down: they find what can be borne at x = 0, whence motion starts.
+# Directions in (u, x), each in units of its bound, in which polygons are explored.
 _DIRECTIONS = [
-    (math.sin(a), math.cos(a)) for a in np.linspace(-0.6 * np.pi, 0.6 * np.pi, 7)
+    (math.sin(a), math.cos(a)) for a in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 7)
 ]
 
 
@@ -73,7 +72,9 @@ def demand_at(
 
     Args:
         kin: Workspace.
-        q: (nq,); slope: (nv,) dq/ds; bend: (nv,) d2q/ds2, on the manifold.
+        q: (nq,).
+        slope: (nv,) dq/ds on the manifold.
+        bend: (nv,) its derivative, d2q/ds2.
         contacts: Those that may bear.
     """
     m, d = kin.world.model, kin.data
@@ -129,7 +130,8 @@ def bearable(
         kin: Workspace.
         demand: At this point.
         slope: (nv,) dq/ds, for the joints' viscous damping.
-        u_max: Bound of |u|; x_max: of x.
+        u_max: Bound of |u|.
+        x_max: Bound of x.
     """
     w = kin.world
     weight = w.mass * 9.81
@@ -152,10 +154,14 @@ def bearable(
     upper = np.concatenate([[1.0, 1.0], np.full(nf, 1e30), upper])
     H = np.diag(np.full(2 + nf, _RANK))
     corners = []
-    fixed = upper.copy(), lower.copy()
-    fixed[0][:2] = fixed[1][:2] = 0.0
+    still = upper.copy(), lower.copy()
+    still[0][:2] = still[1][:2] = 0.0
+    starting = upper.copy(), lower.copy()
+    starting[0][1] = 0.0
     for bounds, direction in (
-        (fixed, (0.0, 0.0)),
+        (still, (0.0, 0.0)),
+        (starting, (-1.0, 0.0)),
+        (starting, (1.0, 0.0)),
         *(((upper, lower), d) for d in _DIRECTIONS),
     ):
         f = np.zeros(2 + nf)
@@ -179,7 +185,11 @@ def least_torques(kin: Kinematics, demand: Demand, u: float, x: float) -> np.nda
     E = _loads(demand, weight)
     edges = demand.cones.reshape(-1, 3)
     nc, m, _ = demand.cones.shape
-    H = np.kron(np.eye(nc), np.ones((m, m))) * (edges @ edges.T) + 1e-6 * np.eye(nc * m)
+    normal = np.repeat(demand.cones.mean(axis=1), m, axis=0)
+    along = np.sum(edges * normal, axis=1)
+    # Tangential forces count four times, as in `contact_forces`.
+    metric = 4.0 * edges @ edges.T - 3.0 * np.outer(along, along) * (normal @ normal.T)
+    H = np.kron(np.eye(nc), np.ones((m, m))) * metric + 1e-6 * np.eye(nc * m)
     H = H + _SLACK * (E[:6].T @ E[:6]) / weight**2
     f = -_SLACK * (E[:6].T @ total[:6]) / weight**2
     n = nc * m
@@ -247,13 +257,14 @@ def _half_planes(corners: np.ndarray) -> np.ndarray:
 
 
 def sample_law(s: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """s and ds/dt at each millisecond after the start, the acceleration made smooth.
+    """Path s and ds/dt at each millisecond after the start, made smooth.
 
     Between grid points the acceleration is constant. The law is averaged over a window
     of time, so that its acceleration has no steps; the rate stays its derivative.
 
     Args:
-        s: (n,) grid; x: (n,) squared rates, zero at both ends.
+        s: (n,) grid.
+        x: (n,) squared rates, zero at both ends.
     """
     rate = np.sqrt(x)
     dt = 2.0 * np.diff(s) / np.maximum(rate[1:] + rate[:-1], 1e-9)
@@ -284,7 +295,10 @@ def retime(
 
     Args:
         kin: Workspace.
-        s: (n,) grid; q: (n, nq), slope: (n, nv) dq/ds, bend: (n, nv) d2q/ds2.
+        s: (n,) grid.
+        q: (n, nq).
+        slope: (n, nv) dq/ds on the manifold.
+        bend: (n, nv) its derivative, d2q/ds2.
         contacts: Those that may bear all the way.
         touch: The contact to be made at the end: gently.
     """
