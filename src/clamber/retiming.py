@@ -227,7 +227,9 @@ def fastest(
         F[i, : len(h)], g[i, : len(h)] = h[:, :2], h[:, 2]
 
     class _Polygons(LinearConstraint):
-        def compute_constraint_params(self, path, gridpoints, *args, **kwargs):
+        def compute_constraint_params(
+            self, path: object, gridpoints: np.ndarray, *args: object, **kwargs: object
+        ) -> tuple[np.ndarray | None, ...]:
             a, b = np.tile([1.0, 0.0], (n, 1)), np.tile([0.0, 1.0], (n, 1))
             bound = np.column_stack([np.zeros(n), x_max])
             return a, b, np.zeros((n, 2)), F, g, None, bound
