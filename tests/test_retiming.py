@@ -196,3 +196,14 @@ def test_a_joint_keeps_a_speed_limit_of_its_own(demo_plan, knee_phases, fast):
     slower = build_trajectory(world, knee_phases, speed="max")
     assert np.abs(fast.v[:, dof]).max() > 0.8
     assert np.abs(slower.v[:, dof]).max() < 0.4 * 1.05
+
+
+def test_a_run_folder_keeps_the_word_max_and_numbers():
+    from pydantic import TypeAdapter
+
+    from clamber.pipeline import PlanOptions
+
+    adapter = TypeAdapter(PlanOptions)
+    for speed in ("max", 0.3):
+        written = adapter.dump_json(PlanOptions(speed=speed))
+        assert adapter.validate_json(written).speed == speed
