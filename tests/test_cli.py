@@ -18,7 +18,9 @@ from rich.console import Console
 import clamber
 from clamber import cli
 
-COMMANDS = ("climb", "contacts", "plan", "simulate", "render", "scene", "robot")
+COMMANDS = (
+    *("climb", "contacts", "plan", "simulate", "render", "scene", "robot", "sweep"),
+)
 
 
 def run(*args: object) -> subprocess.CompletedProcess[str]:
