@@ -14,6 +14,7 @@ import io as text_io
 import json
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
@@ -34,7 +35,7 @@ SPEC = "spec.yaml"
 TABLE = "runs.csv"
 TIMINGS = "timings.json"
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-IDLE = 60  # [s] after which a worker without work ends, also where nobody tells it
+IDLE = 60  # [s] after which a worker without work ends
 LOSSES = 3  # workers lost in a row without one row gained end a sweep
 CONNECT = 10.0  # [s] in which a scheduler has to answer
 CRASHED = "error: "  # begins `why` where a job raised what it never should
@@ -114,7 +115,7 @@ def run_sweep(
                 before = len(todo.rows)
                 with contextlib.suppress(BrokenExecutor):
                     with _executor(workers, scheduler) as (executor, count):
-                        for run, outcome, cost in _outcomes(executor, todo, job):
+                        for run, outcome, cost in _outcomes(executor, count, todo, job):
                             table.add(run, outcome)
                             n = len(todo.rows)
                             said = "reached" if outcome.reached else outcome.why
@@ -207,22 +208,21 @@ class _Todo:
 
 
 def _outcomes(
-    executor: Executor, todo: _Todo, job: JobFunction
+    executor: Executor, count: int, todo: _Todo, job: JobFunction
 ) -> Iterator[tuple[Run, Outcome, float]]:
     """Submit what can be run, yield what has ended, until nothing waits."""
-
-    def submit(run: Run) -> Future[tuple[Outcome, float]]:
-        return executor.submit(_timed, job, run.job)
-
-    running = {submit(run): run for run in list(todo.waiting.values())}
-    while running:
+    running: dict[Future[tuple[Outcome, float]], Run] = {}
+    ahead = list(todo.waiting.values())
+    while ahead or running:
+        # Each worker has one in hand and one to go on with: all else can be called off.
+        while ahead and len(running) < 2 * count:
+            run = ahead.pop(0)
+            running[executor.submit(_timed, job, run.job)] = run
         ended, _ = wait(running, return_when=FIRST_COMPLETED)
-        # In the order of submission, not in that of a set.
         for future in [f for f in running if f in ended]:
             run = running.pop(future)
             outcome, cost = future.result()
-            for new in todo.end(run, outcome):
-                running[submit(new)] = new
+            ahead += todo.end(run, outcome)
             yield run, outcome, cost
 
 
@@ -256,7 +256,8 @@ def _executor(
         max_workers=count,
         timeout=IDLE,
         kill_workers=True,
-        initializer=_leave_interrupts,
+        initializer=_begin_worker,
+        initargs=(os.getpid(),),
         env=ONE_THREAD,
     )
     whole = False
@@ -296,9 +297,16 @@ def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
             executor.shutdown(wait=False)  # what has not ended is called off
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C reaches all processes of a terminal; the coordinating one sees to it."""
+def _begin_worker(coordinator: int) -> None:
+    """In a worker: leave Ctrl-C to the coordinating process, but do not outlive it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == coordinator:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 # The table.
