@@ -458,6 +458,8 @@ class SweepCommand:
 
         if self.workers is not None and self.workers < 1:
             raise InputError("1 or more", source="--workers", value=self.workers)
+        if self.workers is not None and self.scheduler is not None:
+            raise InputError("--workers or --scheduler, not both")
         spec = experiment.load_spec(self.spec)
         folder = self.out or Path("runs") / self.spec.stem
         sweep.check_inputs(spec)

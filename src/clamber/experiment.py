@@ -42,7 +42,9 @@ def _number(x: Any) -> Any:
     return x
 
 
-Number = Annotated[float, pydantic.BeforeValidator(_number)]
+Number = Annotated[
+    float, pydantic.BeforeValidator(_number), pydantic.Field(allow_inf_nan=False)
+]
 Value = Annotated[
     int | float | str, pydantic.BeforeValidator(_number)
 ]  # a value of a flag
@@ -80,8 +82,27 @@ class PlusMinus(_Strict):
     about: Number = 0.0
 
 
-Levels = list[Value] | Range
-Distribution = Uniform | PlusMinus | list[Value] | Value
+def _way(x: Any) -> str:
+    """Which way to write a distribution was meant, so that errors are about that."""
+    if isinstance(x, PlusMinus) or (isinstance(x, Mapping) and "plus_minus" in x):
+        return "plus_minus"
+    if isinstance(x, Uniform | Mapping):
+        return "uniform"
+    return "list" if isinstance(x, list) else "value"
+
+
+Levels = Annotated[
+    Annotated[list[Value], pydantic.Tag("list")]
+    | Annotated[Range, pydantic.Tag("range")],
+    pydantic.Discriminator(lambda x: "list" if isinstance(x, list) else "range"),
+]
+Distribution = Annotated[
+    Annotated[Uniform, pydantic.Tag("uniform")]
+    | Annotated[PlusMinus, pydantic.Tag("plus_minus")]
+    | Annotated[list[Value], pydantic.Tag("list")]
+    | Annotated[Value, pydantic.Tag("value")],
+    pydantic.Discriminator(_way),
+]
 
 
 class Sample(_Strict):
