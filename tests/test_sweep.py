@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import csv
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -130,6 +131,21 @@ def test_the_table_does_not_depend_on_the_number_of_workers(
     assert pace.motion == pytest.approx(sum(outcome.seconds for _, outcome in rows))
 
 
+def test_the_pace_says_how_much_of_the_workers_time_was_used(
+    spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(sweep_jobs.SECONDS, "0.05")
+    _, pace = run_sweep(spec, tmp_path / "out", workers=2, job=sweep_jobs.slow)
+    assert 0.05 * RUNS <= pace.taken <= pace.workers * pace.wall
+    assert pace.busy < 0.5 * pace.taken  # these jobs sleep
+    assert pace.occupied == pace.taken / (2 * pace.wall)
+    assert pace.share == pace.busy / (2 * pace.wall)
+    assert pace.speed == pace.motion / pace.busy
+    session = json.loads((tmp_path / "out" / "timings.json").read_text())["sessions"][0]
+    assert session["share_of_workers"] == round(pace.occupied, 3)
+    assert session["times_real_time"] == round(pace.speed, 3)
+
+
 def test_a_row_says_what_was_run_and_what_became_of_it(uninterrupted: bytes):
     rows = list(csv.DictReader(uninterrupted.decode().splitlines()))
     assert [r["run"] for r in rows[:2]] == ["pid-0000", "pid-0001"]
@@ -217,6 +233,19 @@ def test_a_folder_of_another_spec_is_refused(
     assert (out / "runs.csv").read_bytes() == before
     spec_file.write_text("# only a comment\n" + SEARCH)
     assert run_sweep(load_spec(spec_file), out, job=sweep_jobs.slow)[1].runs == 0
+
+
+def test_a_sweep_may_be_made_longer_but_not_shorter(
+    spec: Spec, spec_file: Path, tmp_path: Path, log: Path, uninterrupted: bytes
+):
+    out = tmp_path / "out"
+    spec_file.write_text(SEARCH.replace("runs: 20", "runs: 10"))
+    run_sweep(load_spec(spec_file), out, workers=1, job=sweep_jobs.breaks_at_friction)
+    _, pace = run_sweep(spec, out, workers=1, job=sweep_jobs.slow)
+    assert pace.runs == RUNS // 2
+    assert (out / "runs.csv").read_bytes() == uninterrupted
+    with pytest.raises(InputError, match="is another spec"):
+        run_sweep(load_spec(spec_file), out, job=sweep_jobs.slow)
 
 
 def test_a_table_that_does_not_fit_is_refused(spec: Spec, uninterrupted: bytes):

@@ -316,6 +316,16 @@ def load_spec(path: str | Path) -> Spec:
     return spec
 
 
+def goes_on(old: Spec, new: Spec) -> bool:
+    """Whether the runs of `old` are the first ones of `new`: the same, or more runs."""
+    for kind in ("random", "search"):
+        a, b = getattr(old, kind), getattr(new, kind)
+        if a is not None and b is not None and a.runs <= b.runs:
+            longer = a.model_copy(update={"runs": b.runs})
+            old = old.model_copy(update={kind: longer})
+    return old == new
+
+
 def strands(spec: Spec) -> list[Strand]:
     """All strands, in the order of the final table."""
     out = []

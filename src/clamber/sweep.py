@@ -26,7 +26,15 @@ import yaml
 
 from clamber.demo import load_demo
 from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.experiment import Run, Spec, Strand, load_spec, next_runs, strands
+from clamber.experiment import (
+    Run,
+    Spec,
+    Strand,
+    goes_on,
+    load_spec,
+    next_runs,
+    strands,
+)
 from clamber.io import whole_file
 from clamber.job import Outcome, command_of, run_job
 from clamber.model import load_robot
@@ -53,6 +61,7 @@ class Pace:
         runs: Done in this call.
         workers: Processes that did them.
         wall: From the first run's submission to the last one's end [s].
+        taken: Seconds of all jobs together, by the clock.
         busy: Processor seconds of all jobs together.
         motion: Simulated seconds of all jobs together.
     """
@@ -60,13 +69,19 @@ class Pace:
     runs: int = 0
     workers: int = 0
     wall: float = 0.0
+    taken: float = 0.0
     busy: float = 0.0
     motion: float = 0.0
 
     @property
     def share(self) -> float:
-        """Of the processors' time that jobs had."""
+        """Of the workers' processors that jobs kept busy."""
         return self.busy / max(self.wall * self.workers, 1e-9)
+
+    @property
+    def occupied(self) -> float:
+        """Of the workers' time in which they had a job, whatever ran beside them."""
+        return self.taken / max(self.wall * self.workers, 1e-9)
 
     @property
     def speed(self) -> float:
@@ -86,7 +101,7 @@ def run_sweep(
     """Do all runs of a spec that the folder does not hold yet.
 
     Args:
-        spec: What to run.
+        spec: What to run; with more `runs` than before, those are added.
         folder: Holds `spec.yaml` and `runs.csv`; made, or gone on with.
         workers: Processes; None: one for each core.
         scheduler: Address of a `dask.distributed` scheduler, whose workers do the jobs
@@ -126,7 +141,8 @@ def run_sweep(
                                 runs=pace.runs + 1,
                                 workers=count,
                                 wall=time.perf_counter() - began,
-                                busy=pace.busy + cost,
+                                taken=pace.taken + cost.taken,
+                                busy=pace.busy + cost.busy,
                                 motion=pace.motion + outcome.seconds,
                             )
                 losses = losses + 1 if len(todo.rows) == before else 0
@@ -207,11 +223,19 @@ class _Todo:
         return new
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Cost:
+    """Of one job: seconds by the clock, and of a processor."""
+
+    taken: float
+    busy: float
+
+
 def _outcomes(
     executor: Executor, count: int, todo: _Todo, job: JobFunction
-) -> Iterator[tuple[Run, Outcome, float]]:
+) -> Iterator[tuple[Run, Outcome, _Cost]]:
     """Submit what can be run, yield what has ended, until nothing waits."""
-    running: dict[Future[tuple[Outcome, float]], Run] = {}
+    running: dict[Future[tuple[Outcome, _Cost]], Run] = {}
     ahead = list(todo.waiting.values())
     while ahead or running:
         # Each worker has one in hand and one to go on with: all else can be called off.
@@ -226,14 +250,15 @@ def _outcomes(
             yield run, outcome, cost
 
 
-def _timed(job: JobFunction, what: Any) -> tuple[Outcome, float]:
-    """In a worker: the outcome and its processor seconds. A crash is an outcome too."""
-    began = time.process_time()
+def _timed(job: JobFunction, what: Any) -> tuple[Outcome, _Cost]:
+    """In a worker: the outcome and its cost. A crash is an outcome too."""
+    began, before = time.perf_counter(), time.process_time()
     try:
         outcome = job(what)
     except Exception as e:  # days of runs are not lost for one
         outcome = Outcome(reached=False, why=f"{CRASHED}{type(e).__name__}: {e}")
-    return outcome, time.process_time() - began
+    cost = _Cost(taken=time.perf_counter() - began, busy=time.process_time() - before)
+    return outcome, cost
 
 
 # Who does the jobs.
@@ -442,16 +467,15 @@ def _table(spec: Spec, folder: Path) -> Iterator[_Table]:
                 source="--out",
                 value=str(folder),
             ) from e
-        if copy.exists() and load_spec(copy) != spec:
+        if copy.exists() and not goes_on(load_spec(copy), spec):
             raise InputError(
                 f"a folder of this spec, or a new one: {copy} is another spec",
                 source="--out",
                 value=str(folder),
             )
-        if not copy.exists():
-            content = spec.model_dump(mode="json", by_alias=True, exclude_unset=True)
-            with whole_file(copy) as draft:
-                draft.write_text(yaml.safe_dump(content, sort_keys=False))
+        content = spec.model_dump(mode="json", by_alias=True, exclude_unset=True)
+        with whole_file(copy) as draft:
+            draft.write_text(yaml.safe_dump(content, sort_keys=False))
         path.touch()
         with path.open("r+b") as stream:
             yield _Table(spec, path, stream)
@@ -464,7 +488,8 @@ def _save_pace(path: Path, pace: Pace) -> None:
         sessions = json.loads(path.read_text())["sessions"]
     figures = {
         **asdict(pace),
-        "share_of_cores": pace.share,
+        "share_of_processors": pace.share,
+        "share_of_workers": pace.occupied,
         "times_real_time": pace.speed,
     }
     rounded = {k: round(v, 3) for k, v in figures.items()}
