@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from clamber.errors import InputError
 from clamber.experiment import (
@@ -323,6 +324,29 @@ def test_files_that_a_spec_names_lie_beside_it(tmp_path: Path):
     job = next_runs(spec, strands(spec)[0], [], {})[0].job
     assert job.scene == str(tmp_path / "scene.yaml")
     assert job.robot == "coman"
+
+
+def blocks(page: Path) -> list[str]:
+    """The indented blocks of a page."""
+    out, block = [], []
+    for line in [*page.read_text().splitlines(), "end"]:
+        if line.startswith("    ") or (block and not line):
+            block.append(line.removeprefix("    "))
+        elif block:
+            out.append("\n".join(block))
+            block = []
+    return out
+
+
+def test_the_specs_of_the_documentation_can_be_read():
+    parts = blocks(ROOT / "docs" / "sweeps.md")
+    head = next(b for b in parts if b.startswith("about:"))
+    kinds = [b for b in parts if b.startswith(("grid:", "random:", "search:"))]
+    assert len(kinds) == 4
+    for kind in kinds:
+        spec = Spec.model_validate(yaml.safe_load(f"{head}\n{kind}"))
+        for strand in strands(spec):
+            assert next_runs(spec, strand, [], {})
 
 
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda p: p.stem)

@@ -38,6 +38,7 @@ from clamber.experiment import (
 from clamber.io import whole_file
 from clamber.job import Outcome, command_of, run_job
 from clamber.model import load_robot
+from clamber.scene import load_scene
 
 SPEC = "spec.yaml"
 TABLE = "runs.csv"
@@ -170,8 +171,6 @@ def check_inputs(spec: Spec) -> None:
         load_demo(demo)
     for robot in sorted({j.robot for j in jobs}):
         load_robot(robot)
-    from clamber.scene import load_scene
-
     for scene in sorted({j.scene for j in jobs if j.scene is not None}):
         load_scene(scene)
 
