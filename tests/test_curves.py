@@ -162,6 +162,7 @@ def test_runs_that_do_not_set_a_factor_are_in_none_of_its_bins():
         {
             "random": {
                 "runs": 60,
+                "factors": {"disturb.mass": 1.1},
                 "either": [
                     {"disturb.unevenness": 0.03},
                     {"disturb.height": {"plus_minus": 0.03}},
@@ -171,9 +172,12 @@ def test_runs_that_do_not_set_a_factor_are_in_none_of_its_bins():
         },
         lambda run: run.job.disturb.unevenness > 0,
     )
+    (mass,) = [b for b in bins(spec, rows) if b.factor == "disturb.mass"]
+    assert (mass.first, mass.middle, mass.last, mass.runs) == (1.1, 1.1, 1.1, 60)
     uneven = [b for b in bins(spec, rows) if b.factor == "disturb.unevenness"]
     high = [b for b in bins(spec, rows) if b.factor == "disturb.height"]
     assert sum(b.runs for b in uneven) + sum(b.runs for b in high) == 60
+    assert {b.middle for b in uneven} == {0.03}  # to the last bit
     assert {b.share for b in uneven} == {1.0}
     assert {b.share for b in high} == {0.0}
 

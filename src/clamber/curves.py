@@ -30,6 +30,7 @@ PICTURE = "success.png"
 BIN_RUNS = 6  # at least, in a bin that holds more than one value
 MAX_BINS = 8
 COLOURS = {"pid": "#b91c1c", "mixed": "#1d4ed8"}
+MARKERS = {"pid": "s", "mixed": "o"}
 UNITS = {
     "height": "m",
     "speed": "rad/s",
@@ -171,7 +172,7 @@ def draw_success(spec: Spec, rows: Rows, path: Path) -> Path:
         ax.set_visible(False)
     for ax in axes[::across]:
         ax.set_ylabel("success")
-    said = "bars: 95 % (Wilson); curve: logistic fit" if spec.search else "bars: 95 %"
+    said = "bars: 95 % (Wilson)" + ("; curve: logistic fit" if spec.search else "")
     fig.suptitle(f"{spec.about or 'Success'} ({said})", fontsize=9, wrap=True)
     return save_plot(fig, path)
 
@@ -235,12 +236,14 @@ def _bin(controller: str, factor: str, part: list[tuple[Any, Outcome]]) -> Bin:
     n, k = len(part), sum(o.reached for _, o in part)
     low, high = wilson(k, n)
     values = [v for v, _ in part]
+    # The mean of equal numbers can differ from them in the last bit.
+    middle = values[0] if values[0] == values[-1] else float(np.mean(values))
     return Bin(
         controller=controller,
         factor=factor,
         first=values[0],
         last=values[-1],
-        middle=values[0] if isinstance(values[0], str) else float(np.mean(values)),
+        middle=middle,
         runs=n,
         reached=k,
         share=k / n,
@@ -267,8 +270,9 @@ def _draw_bins(ax: Axes, controller: str, mine: Sequence[Bin]) -> None:
         share,
         yerr=np.maximum(ends.T, 0.0),
         xerr=wide,
-        fmt="o",
-        ms=4,
+        fmt=MARKERS[controller],
+        ms=6,
+        mfc="none",
         lw=1,
         capsize=2,
         color=COLOURS[controller],
