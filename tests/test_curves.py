@@ -5,11 +5,15 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import runpy
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from clamber.curves import (
@@ -20,10 +24,13 @@ from clamber.curves import (
     save_curves,
     summarise,
 )
-from clamber.experiment import Run, Spec, next_runs, strands
+from clamber.experiment import Run, Spec, load_spec, next_runs, strands
 from clamber.job import Outcome
 from clamber.success import wilson
-from clamber.sweep import CRASHED, Rows
+from clamber.sweep import CRASHED, Rows, cells, columns
+from conftest import ROOT
+
+EXPERIMENTS = ROOT / "examples" / "experiments"
 
 
 def swept(content: dict, reached: Callable[[Run], bool]) -> tuple[Spec, Rows]:
@@ -238,3 +245,40 @@ def test_the_picture_shows_the_level_at_which_success_breaks(tmp_path: Path):
     step = column(0.6) - column(0.4)
     assert column(0.8) - column(0.6) == pytest.approx(step, abs=0.03)
     assert not math.isnan(step)
+
+
+def test_the_page_of_experiments_tells_what_has_been_run(tmp_path: Path):
+    """Two of the experiments, one of them not done yet, with quick jobs."""
+    runs, docs = tmp_path / "runs", tmp_path / "docs"
+    for name, limit in (("friction", 0.5), ("all-at-once", 0.0)):
+        spec = load_spec(EXPERIMENTS / f"{name}.yaml")
+        _, rows = swept(
+            spec.model_dump(by_alias=True, exclude_unset=True),
+            lambda run, limit=limit: run.factors["disturb.friction"] > limit,
+        )
+        folder = runs / name
+        folder.mkdir(parents=True)
+        text = yaml.safe_dump(spec.model_dump(by_alias=True, exclude_unset=True))
+        (folder / "spec.yaml").write_text(text)
+        kept = rows if name == "friction" else rows[:-100]
+        with (folder / "runs.csv").open("w", newline="") as f:
+            writer = csv.writer(f, lineterminator="\n")
+            writer.writerow(columns(spec))
+            writer.writerows(cells(spec, *row) for row in kept)
+    script = EXPERIMENTS / "page.py"
+    subprocess.run([sys.executable, script, runs, docs], check=True)
+    text = (docs / "experiments.md").read_text()
+    assert text.index("## Friction of ground and box") < text.index("## All at once")
+    assert "clamber sweep examples/experiments/friction.yaml" in text
+    (pid,) = [x for x in text.splitlines() if x.startswith("| pid | 1 | 0.15 | 40 |")]
+    assert float(pid.split("|")[5]) == pytest.approx(0.5, abs=0.02)
+    assert "So far 500 of 600 runs." in text
+    assert "| pid | 300 | 300 | 100.0 % | 98.7 to 100.0 % |" in text
+    assert "| mixed | 200 | 200 | 100.0 % | 98.1 to 100.0 % |" in text
+    pictures = {f.name for f in (docs / "experiments").iterdir()}
+    assert pictures == {"friction.png", "all-at-once.png"}
+
+
+def test_every_experiment_has_its_place_on_the_page():
+    order = runpy.run_path(str(EXPERIMENTS / "page.py"))["ORDER"]
+    assert sorted(order) == sorted(f.stem for f in EXPERIMENTS.glob("*.yaml"))

@@ -311,7 +311,7 @@ def test_a_cluster_that_loses_a_worker_in_mid_run_loses_and_doubles_no_row(
     monkeypatch: pytest.MonkeyPatch,
 ):
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setenv(sweep_jobs.SECONDS, "0.2")
+    monkeypatch.setenv(sweep_jobs.SECONDS, "0.3")
     out = tmp_path / "out"
     results: list[tuple] = []
     with distributed.LocalCluster(
@@ -339,6 +339,52 @@ def test_a_cluster_that_loses_a_worker_in_mid_run_loses_and_doubles_no_row(
     # What the lost worker was doing was begun again by another.
     assert counts[last.name.split("-")[0]] == 2
     assert sum(counts.values()) <= RUNS + 2
+
+
+def test_a_cluster_that_gives_a_run_up_ends_the_sweep_with_a_sentence(
+    spec: Spec, tmp_path: Path
+):
+    distributed = pytest.importorskip("distributed")
+    import dask
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        pytest.raises(ClamberError, match=r"run pid-00\d\d could not be done \(Killed"),
+    ):
+        run_sweep(
+            spec,
+            tmp_path / "out",
+            scheduler=cluster.scheduler_address,
+            job=sweep_jobs.always_dies,
+        )
+
+
+def test_a_scheduler_that_goes_away_ends_the_sweep_and_keeps_the_rows(
+    spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv(sweep_jobs.SECONDS, "0.2")
+    out = tmp_path / "out"
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+
+        def leave(stage: str, share: float, note: str) -> None:
+            if share > 0.1:
+                cluster.close()
+
+        with pytest.raises(ClamberError, match="goes on from there"):
+            run_sweep(
+                spec,
+                out,
+                scheduler=cluster.scheduler_address,
+                job=sweep_jobs.slow,
+                progress=leave,
+            )
+    assert 4 < len(rows_of(out)) < RUNS
 
 
 def test_a_scheduler_that_does_not_answer_is_named(

@@ -244,7 +244,16 @@ def _outcomes(
         ended, _ = wait(running, return_when=FIRST_COMPLETED)
         for future in [f for f in running if f in ended]:
             run = running.pop(future)
-            outcome, cost = future.result()
+            try:
+                outcome, cost = future.result()
+            except BrokenExecutor:
+                raise
+            except Exception as e:  # not the job's own: `_timed` catches those
+                raise ClamberError(
+                    f"run {run.name} could not be done ({type(e).__name__}: {e});"
+                    f" {len(todo.rows)} of {todo.total} rows are kept, and the same"
+                    " command goes on from there"
+                ) from e
             ahead += todo.end(run, outcome)
             yield run, outcome, cost
 
