@@ -41,6 +41,8 @@ LAYERS = [
     "trajectory",
     "pipeline",
     "control",
+    "terrain",
+    "adaptation",
     "execution",
     "simulation",
     "alternatives",
