@@ -24,6 +24,7 @@ from clamber.se3 import matrix_from_quat
 HEIGHT_SIGMA = 0.05  # [m] what is expected of a box's height
 SLOPE_SIGMA = 0.12  # [rad] ... and of its slopes
 FELT_SIGMA = 0.006  # [m] how well a contact's height is felt on a smooth top
+CAUTION = 0.02  # [m] least distance more from a top that was felt
 ROUGHNESS = (0.0, 0.010, 0.020, 0.035)  # [m] that a top may have
 
 
@@ -57,7 +58,7 @@ def fitted_box(box: Box, points: np.ndarray) -> Box:
         box,
         rotation=R @ box.rotation,
         position=middle + lowest * normal + R @ (box.position - top.position),
-        roughness=max(rough - lowest, box.roughness),
+        roughness=max(rough - lowest, CAUTION, box.roughness),
     )
 
 
