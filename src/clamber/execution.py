@@ -261,6 +261,8 @@ class Execution:
     def _check_stance(self) -> Ticks:
         """At a keyframe: is every contact where it should be, and does it bear?"""
         stance = self._keyframes[self._leg].stance
+        if self._leg == len(self._legs):  # the last one: nothing depends on it
+            return
         for c in stance:
             if self._force(c) >= LOST or self._other(c) is not None:
                 continue
@@ -273,8 +275,6 @@ class Execution:
                 yield from self._replan((*others, felt), others)
                 return
             self._resume()
-        if self._leg == len(self._legs):
-            return
         actual = tuple(self._other(c) or c for c in stance)
         for c in actual:
             up, side = self._off(c)

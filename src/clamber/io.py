@@ -64,7 +64,7 @@ _OF_AN_EARLIER_PLAN = (
     PLANNED_SCENE,
     PLANNED_TRAJECTORY,
 )
-_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped"}
+_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped", "rests_on"}
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -932,6 +932,7 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
             "events": [asdict(e) for e in rollout.events],
             "fell": rollout.fell,
             "stopped": rollout.stopped,
+            "rests_on": rollout.rests_on,
         },
     )
 
@@ -986,6 +987,7 @@ def load_rollout(folder: str | Path) -> Rollout:
         events=tuple(Event(time=e.time, text=e.text) for e in file.events),
         fell=file.fell,
         stopped=file.stopped,
+        rests_on=tuple(file.rests_on),
     )
 
 
@@ -999,6 +1001,7 @@ class _ExecutionFile(pydantic.BaseModel):
     events: list[_EventFile]
     fell: bool
     stopped: str
+    rests_on: list[str]
 
 
 class _CriterionFile(pydantic.BaseModel):
