@@ -8,9 +8,12 @@ At a configuration q, with the step `dq` in the tangent space as the variable,
           A (p_G + J_G dq) <= b - margin                                balance
           d_i + n_i' (J_2 - J_1) dq >= clearance_i                      distances
 
-then q <- q (+) dq. Contacts and joint limits are hard; balance and distances are
-softened by the solver with a weight of 1e6, so that they give way by micrometres, or
-visibly where nothing satisfies them: `residuals` tells, without the solver.
+then q <- q (+) dq. Joint limits are hard. Contacts, balance and distances weigh 1e6
+against the soft tasks, in the QP as in the merit by which a step is judged: they give
+way by micrometres, or visibly where nothing satisfies them (`residuals` tells, without
+the solver), and each step lowers the merit to first order. With contacts as equalities
+it would not: a step that closed them at the cost of a distance was taken back, and
+solves stalled where everything is tight.
 
 Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 """
@@ -44,14 +47,14 @@ DAMPING = 2e-4  # mu
 NEAR_RANGE = 0.03  # [m] pairs this near always have a row
 SLOW = 0.01  # share of the merit; three steps that gain less end the solve
 MIN_RADIUS = 1e-3  # of the trust region, where the solve has stalled
-PENALTY = 1e6  # of violations against the soft cost, in the merit of a step
+PENALTY = 1e6  # of violations against the soft cost, in the QP and in the merit
 CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
-SOFT, EQUALITY = 8, 5  # daqp's constraint types
+SOFT = 8  # daqp's type of a constraint that may give way
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -263,17 +266,18 @@ class _Rows:
 class QP:
     """min 1/2 x'Hx + c'x with bounds on x first, then rows `lo <= A x <= hi`.
 
-    `equalities` rows come first; `merit` is the penalised cost of the configuration it
-    was built at.
+    Contacts are the rows `C x = e`; `merit` is the penalised cost of the configuration
+    it was built at.
     """
 
     H: np.ndarray
     c: np.ndarray
+    C: np.ndarray
+    e: np.ndarray
     A: np.ndarray
     lo: np.ndarray
     hi: np.ndarray
     sense: np.ndarray
-    equalities: int
     merit: float
 
 
@@ -297,7 +301,7 @@ class IK:
         self._dofs, self._angles = _as_slice(world.dadr), _as_slice(world.qadr)
         self._q_min = np.maximum(world.q_min[world.dadr], -1e30)
         self._q_max = np.minimum(world.q_max[world.dadr], 1e30)
-        self._senses: dict[tuple[int, int], np.ndarray] = {}
+        self._senses: dict[int, np.ndarray] = {}
         self._violation = 0.0
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._geom_body = world.model.geom_bodyid
@@ -339,36 +343,33 @@ class IK:
             c[self._dofs] += weight * off
             cost += 0.5 * weight * float(off @ off)
 
-        m = nv + hard.n
-        lo, hi = np.empty(m + ineq.n), np.empty(m + ineq.n)
+        lo, hi = np.empty(nv + ineq.n), np.empty(nv + ineq.n)
         lo[:nv], hi[:nv] = -1e30, 1e30
         now = q[self._angles]
         lo[self._dofs] = np.minimum(self._q_min - now, 0.0)
         hi[self._dofs] = np.maximum(self._q_max - now, 0.0)
-        lo[nv:m] = hi[nv:m] = hard.lo[: hard.n]
-        lo[m:], hi[m:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
+        lo[nv:], hi[nv:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
         return QP(
             H=H,
             c=c,
-            A=np.concatenate((hard.J[: hard.n], ineq.J[: ineq.n])),
+            C=hard.J[: hard.n].copy(),
+            e=hard.lo[: hard.n].copy(),
+            A=ineq.J[: ineq.n].copy(),
             lo=lo,
             hi=hi,
-            sense=self._sense(hard.n, ineq.n),
-            equalities=hard.n,
+            sense=self._sense(ineq.n),
             merit=cost + 0.5 * PENALTY * self._violation,
         )
 
-    def _sense(self, equalities: int, inequalities: int) -> np.ndarray:
-        """(nv + m,) daqp's constraint types: bounds, contacts, softened rows."""
-        key = (equalities, inequalities)
-        if key not in self._senses:
-            counts = (self.world.model.nv, equalities, inequalities)
-            sense = np.repeat(np.array([0, EQUALITY, SOFT], np.int32), counts)
-            self._senses[key] = sense
-        return self._senses[key]
+    def _sense(self, rows: int) -> np.ndarray:
+        """(nv + m,) daqp's constraint types: bounds, then softened rows."""
+        if rows not in self._senses:
+            counts = (self.world.model.nv, rows)
+            self._senses[rows] = np.repeat(np.array([0, SOFT], np.int32), counts)
+        return self._senses[rows]
 
     def step(self, qp: QP, radius: float = 1.0) -> np.ndarray:
-        """Solve; contacts that contradict one another become soft, heavily weighted.
+        """Solve; what cannot all be satisfied is shared out by least squares.
 
         Args:
             qp: From `build`.
@@ -381,23 +382,9 @@ class IK:
         lo, hi = np.minimum(qp.lo, reach), np.maximum(qp.hi, -reach)
         np.maximum(lo[:nv], -step, out=lo[:nv])
         np.minimum(hi[:nv], step, out=hi[:nv])
-        hard = slice(nv, nv + qp.equalities)
-        np.maximum(lo[hard], -reach, out=lo[hard])
-        np.minimum(hi[hard], reach, out=hi[hard])
-        x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, hi, lo, qp.sense)
-        if flag > 0:
-            return x
-        m = hard.stop - nv
-        J, e = qp.A[:m], -lo[hard]
-        keep = np.r_[0:nv, nv + m : len(qp.lo)]
-        x, _, flag, _ = daqp.solve(
-            qp.H + 1e4 * J.T @ J,
-            qp.c + 1e4 * J.T @ e,
-            qp.A[m:],
-            hi[keep],
-            lo[keep],
-            qp.sense[keep],
-        )
+        heavy = PENALTY * qp.C.T
+        H, c = qp.H + heavy @ qp.C, qp.c - heavy @ np.clip(qp.e, -reach, reach)
+        x, _, flag, _ = daqp.solve(H, c, qp.A, hi, lo, qp.sense, rho_soft=1.0 / PENALTY)
         return x if flag > 0 else np.zeros(nv)
 
     def solve(
