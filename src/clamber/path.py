@@ -114,7 +114,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
             taken as it is, for comparison.
     """
     t = transition
-    before, made = (*t.held, *t.leaving), t.held
+    made = t.held
     if t.move.makes:
         made = (*t.held, t.move.makes)
     closed = (*t.held, *t.rolling)
@@ -122,9 +122,9 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     phases = (
         Phase(
             kind="shift",
-            q=bridge(ik, t.before, t.shifted, closed, before),
+            q=bridge(ik, t.before, t.shifted, closed, t.stance),
             contacts=closed,
-            load_before=before,
+            load_before=t.stance,
             load_after=t.held,
         ),
         Phase(

@@ -31,6 +31,7 @@ from clamber.transition import (
     approach_contact,
     eased_contact,
     plan_transition,
+    rolled,
 )
 
 METHODS = {
@@ -187,6 +188,28 @@ def plan_step(
     held = tuple(c for c in before.stance if c.surface not in move.breaks)
     if not held:
         return f"{move}: nothing else bears load"
+    result = _plan_on(ik, before, step, held, method, options, lap)
+    if isinstance(result, str) and move.makes:
+        # On tiptoe, feet that stay reach farther.
+        tiptoe = tuple(rolled(ik, before.q, c, move.makes.position) for c in held)
+        if any(a is not b for a, b in zip(held, tiptoe, strict=True)):
+            other = _plan_on(ik, before, step, tiptoe, method, options, lap)
+            if not isinstance(other, str):
+                return other
+    return result
+
+
+def _plan_on(
+    ik: IK,
+    before: Keyframe,
+    step: Step,
+    held: tuple[Contact, ...],
+    method: str,
+    options: KeyframeOptions,
+    lap: Callable[[str], None],
+) -> tuple[Keyframe, Path] | str:
+    """The next keyframe and the path to it on the contacts `held`, or why not."""
+    move = step.move
     task = KeyframeTask(
         held=held,
         new=(move.makes,) if move.makes else (),

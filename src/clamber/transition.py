@@ -46,8 +46,9 @@ class Transition:
         before, after: Configurations (nq,) of the keyframes.
         shifted: (nq,) all old contacts closed, weight on those that stay.
         touching: (nq,) the new contact closed, not loaded.
-        held: Contacts that stay.
-        leaving: Contacts that are broken, as they were; `rolling` as they are let go.
+        stance: Contacts at its start.
+        held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
+        rolling: Contacts that are broken, as they are let go.
         margin: Of the centre of mass to the border of its polygon, throughout [m].
         status: Of the worst of its postures, with its residuals.
     """
@@ -57,13 +58,18 @@ class Transition:
     shifted: np.ndarray
     touching: np.ndarray
     after: np.ndarray
+    stance: tuple[Contact, ...]
     held: tuple[Contact, ...]
-    leaving: tuple[Contact, ...]
     rolling: tuple[Contact, ...]
     margin: float
     iterations: int
     status: Status
     residuals: Residuals
+
+    @property
+    def leaving(self) -> tuple[Contact, ...]:
+        """Contacts that are broken, as they were."""
+        return tuple(c for c in self.stance if c.surface in self.move.breaks)
 
 
 def reach_to_support(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -103,7 +109,7 @@ def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
     person gains on tiptoe.
     """
     edges = ik.world.edges[c.surface]
-    if not edges:
+    if not edges or c.edge is not None:
         return c
     ik.kin.update(q)
     normal = ik.world.supports[c.support].normal
@@ -170,7 +176,8 @@ def plan_transition(
         margin: Of the centre of mass to the border of its polygon [m].
     """
     world = ik.world
-    held = tuple(c for c in before.stance if c.surface not in move.breaks)
+    new = move.makes.surface if move.makes is not None else None
+    held = tuple(c for c in after.stance if c.surface != new)
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
     middle = np.mean([c.position for c in held], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
@@ -195,8 +202,8 @@ def plan_transition(
         shifted=shift.q,
         touching=touching,
         after=after.q,
+        stance=before.stance,
         held=held,
-        leaving=leaving,
         rolling=rolling,
         margin=margin,
         iterations=sum(s.iterations for s in solutions),
