@@ -273,7 +273,7 @@ def eased_contact(ik: IK, before: Keyframe, move: Move, surface: str) -> Contact
     ik.kin.update(solution.q)
     support = world.supports[moved.support]
     p = ik.kin.contact_point(surface, support.normal)
-    return replace(moved, position=p - support.normal * support.height(p))
+    return replace(moved, position=support.project(p))
 
 
 def approach_contact(
@@ -308,5 +308,4 @@ def approach_contact(
     ik.kin.update(solution.q)
     support = world.supports[wanted.support]
     p = ik.kin.contact_point(wanted.surface, support.normal)
-    p = p - support.normal * support.height(p)
-    return replace(wanted, position=p), solution
+    return replace(wanted, position=support.project(p)), solution

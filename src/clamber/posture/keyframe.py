@@ -290,7 +290,7 @@ def finish(
         Contact(
             surface=c.surface,
             support=c.support,
-            position=p,
+            position=world.supports[c.support].project(p),
             quaternion=_orientation(kin, c),
             link=quat_from_matrix(kin.rotation(world.surfaces[c.surface].body)),
         )
