@@ -29,7 +29,7 @@ from clamber.se3 import quat_from_matrix
 from clamber.transition import (
     MARGINS,
     approach_contact,
-    eased_contact,
+    eased_contacts,
     plan_transition,
     rolled,
 )
@@ -40,7 +40,6 @@ METHODS = {
     "gradient": gradient.optimise,
 }
 MAX_REPAIRS = 4  # earlier contacts that may be put elsewhere for a later step's sake
-MOVED = 0.005  # [m] a repair by less is none
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -104,12 +103,13 @@ def plan_steps(
             k += 1
             continue
         repairs += 1
-        j, contact = better
+        for j, contact in better.items():
+            firm = replace(steps[done[j]].move, makes=contact, firm=True)
+            steps[done[j]] = replace(steps[done[j]], move=firm)
+        j = min(better)
         k = done[j]
         del keyframes[j + 1 :], paths[j:], done[j:]
         missed = {i: m for i, m in missed.items() if i < k}
-        firm = replace(steps[k].move, makes=contact, firm=True)
-        steps[k] = replace(steps[k], move=firm)
     return Found(
         keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed.values())
     )
@@ -152,26 +152,24 @@ def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
 
 def repair(
     ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
-) -> tuple[int, Contact] | None:
-    """Which earlier path should have made its contact elsewhere for `move` to work.
+) -> dict[int, Contact] | None:
+    """Which earlier paths should have made their contacts elsewhere for `move` to work.
 
-    Looks at the last contact first.
+    Looks at one contact after the other, the last one first, and then at all at once.
 
     Returns:
-        Index of the path, and the contact at its better place; None where none helps.
+        By index of the path, the contact at its better place; None where none helps.
     """
     standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
+    made: dict[str, int] = {}
     for j in range(len(paths) - 1, -1, -1):
-        made = paths[j].transition.move.makes
-        if made is None or made.surface not in standing_on:
-            continue
-        standing_on.discard(made.surface)
-        contact = eased_contact(ik, keyframes[-1], move, made.surface)
-        if (
-            contact is not None
-            and np.linalg.norm(contact.position - made.position) > MOVED
-        ):
-            return j, contact
+        new = paths[j].transition.move.makes
+        if new is not None and new.surface in standing_on and new.surface not in made:
+            made[new.surface] = j
+    for surfaces in (*([x] for x in made), list(made)):
+        eased = eased_contacts(ik, keyframes[-1], move, surfaces)
+        if eased is not None:
+            return {made[c.surface]: c for c in eased}
     return None
 
 

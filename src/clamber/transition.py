@@ -8,7 +8,7 @@ centre of mass inside the ellipse of the remaining contacts (4.28).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,7 @@ MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the
 # that can be kept
 ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
 LEAN_WEIGHT = 0.5  # soft task (4.27)
+MOVED = 0.005  # [m] a contact that lies nearer to where it was has not moved
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
 
 
@@ -237,43 +238,86 @@ def _touch(
     return ik.solve_hard(problem, after)
 
 
-def eased_contact(ik: IK, before: Keyframe, move: Move, surface: str) -> Contact | None:
-    """Where an earlier contact should have been for a move's weight shift to work.
+def eased_contacts(
+    ik: IK, before: Keyframe, move: Move, surfaces: Collection[str]
+) -> tuple[Contact, ...] | None:
+    """Where earlier contacts should have been for a move to work.
 
-    Solves the shift with that contact free on its support.
+    Solves the move's weight shift with these contacts free on their supports; where
+    that works as they are, the posture in which the new contact closes.
+
+    Args:
+        ik: Workspace.
+        before: Keyframe it starts from.
+        move: That does not work.
+        surfaces: Whose contacts are free.
 
     Returns:
-        The contact at its better place; None where that does not help either.
+        The contacts at their better places; None where that does not help either.
     """
-    world = ik.world
-    held = tuple(c for c in before.stance if c.surface not in (*move.breaks, surface))
-    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
-    moved = next(c for c in before.stance if c.surface == surface)
-    middle = np.mean([c.position for c in (*held, moved)], axis=0)
-    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
-    goal = ContactGoal(
-        surface=surface,
-        support=moved.support,
-        position=moved.position,
-        rotation=support_rotation(world.supports[moved.support], moved.quaternion),
-        free=True,
-        reference=1.0,
+    held = tuple(
+        c for c in before.stance if c.surface not in {*move.breaks, *surfaces}
     )
-    problem = balance_problem(
-        world,
+    moved = tuple(c for c in before.stance if c.surface in surfaces)
+    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    middle = np.mean([c.position for c in (*held, *moved)], axis=0)
+    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
+    free = tuple(_free_goal(ik, c, 1.0) for c in moved)
+    touching = {c.surface: c.support for c in moved}
+    shift = balance_problem(
+        ik.world,
         held=held,
         closed=rolling,
         q_reference=before.q,
-        extra=(goal,),
-        touching={surface: moved.support},
+        extra=free,
+        touching=touching,
     )
-    solution = ik.solve_hard(problem, before.q)
-    if solution.status is not Status.SOLVED:
-        return None
-    ik.kin.update(solution.q)
-    support = world.supports[moved.support]
-    p = ik.kin.contact_point(surface, support.normal)
-    return replace(moved, position=support.project(p))
+    problems = [shift]
+    if move.makes is not None:
+        new, at = move.makes, move.makes.position
+        problems.append(
+            balance_problem(
+                ik.world,
+                held=tuple(rolled(ik, before.q, c, at) for c in held),
+                q_reference=before.q,
+                extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
+                touching=touching | {new.surface: new.support},
+            )
+        )
+    for problem in problems:
+        solution = ik.solve_hard(problem, before.q)
+        if solution.status is not Status.SOLVED:
+            return None
+        ik.kin.update(solution.q)
+        eased = tuple(_touching_at(ik, c) for c in moved)
+        if any(
+            np.linalg.norm(a.position - b.position) > MOVED
+            for a, b in zip(eased, moved, strict=True)
+        ):
+            return eased
+    return None
+
+
+def _free_goal(
+    ik: IK, c: Contact, reference: float, *, loaded: bool = True
+) -> ContactGoal:
+    """Closed on its support, near where it is wanted."""
+    return ContactGoal(
+        surface=c.surface,
+        support=c.support,
+        position=c.position,
+        rotation=support_rotation(ik.world.supports[c.support], c.quaternion),
+        free=True,
+        loaded=loaded,
+        reference=reference,
+    )
+
+
+def _touching_at(ik: IK, c: Contact) -> Contact:
+    """The contact where its surface touches the support at the present posture."""
+    support = ik.world.supports[c.support]
+    p = ik.kin.contact_point(c.surface, support.normal)
+    return replace(c, position=support.project(p))
 
 
 def approach_contact(
@@ -287,25 +331,13 @@ def approach_contact(
         wanted: Where the contact would be liked.
         q: (nq,) to start from.
     """
-    world = ik.world
-    goal = ContactGoal(
-        surface=wanted.surface,
-        support=wanted.support,
-        position=wanted.position,
-        rotation=support_rotation(world.supports[wanted.support], wanted.quaternion),
-        free=True,
-        loaded=False,
-        reference=APPROACH_WEIGHT,
-    )
     problem = balance_problem(
-        world,
+        ik.world,
         held=held,
         q_reference=q,
-        extra=(goal,),
+        extra=(_free_goal(ik, wanted, APPROACH_WEIGHT, loaded=False),),
         touching={wanted.surface: wanted.support},
     )
     solution = ik.solve_hard(problem, q)
     ik.kin.update(solution.q)
-    support = world.supports[wanted.support]
-    p = ik.kin.contact_point(wanted.surface, support.normal)
-    return replace(wanted, position=support.project(p)), solution
+    return _touching_at(ik, wanted), solution
