@@ -398,11 +398,35 @@ class IK:
         """Iterate from `q` until the step is below `tolerance`.
 
         A trust region on an exact penalty: a step that raises the merit is taken back
-        and tried again a quarter as long. The first step is always taken: a new contact
-        must be allowed to start.
+        and tried again a quarter as long. The first step is taken all the same: a limb
+        that sets out pays for it at first. Where that has not paid off in the end, the
+        solve begins again without.
         """
+        start = self.build(problem, q)
+        n, converged, x, qp = self._descend(
+            problem, q, start, iterations, tolerance, leap=True
+        )
+        if qp.merit > start.merit:
+            more, converged, x, qp = self._descend(
+                problem, q, start, iterations, tolerance, leap=False
+            )
+            n += more
+        return Solution(
+            q=x, iterations=n, residuals=self.residuals(problem, x), converged=converged
+        )
+
+    def _descend(
+        self,
+        problem: PostureProblem,
+        q: np.ndarray,
+        qp: QP,
+        iterations: int,
+        tolerance: float,
+        *,
+        leap: bool,
+    ) -> tuple[int, bool, np.ndarray, QP]:
+        """Iterations, whether they converged, and where they ended."""
         n, converged, radius, slow = 0, False, 1.0, 0
-        qp = self.build(problem, q)
         for n in range(1, iterations + 1):
             dq = self.step(qp, radius)
             size = float(np.abs(dq).max())
@@ -410,7 +434,7 @@ class IK:
             # The next step will hardly be much longer than this one.
             reach = min(NEAR_RANGE + size, ACTIVE_RANGE)
             new = self.build(problem, trial, reach)
-            if n == 1 or new.merit <= qp.merit:
+            if (leap and n == 1) or new.merit <= qp.merit:
                 gain = qp.merit - new.merit
                 slow = slow + 1 if gain < SLOW * new.merit else 0
                 small = size < tolerance and size < 0.9 * radius * STEP_ROTATION
@@ -421,9 +445,7 @@ class IK:
                 radius *= 0.25
             if converged or radius < MIN_RADIUS:
                 break
-        return Solution(
-            q=q, iterations=n, residuals=self.residuals(problem, q), converged=converged
-        )
+        return n, converged, q, qp
 
     def solve_hard(self, problem: PostureProblem, q: np.ndarray) -> Solution:
         """`solve` for postures far from `q`, with more than one way to get there.
