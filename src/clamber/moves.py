@@ -36,11 +36,18 @@ class Move:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Step:
-    """A move, and the stance of the demonstration that it leads to."""
+    """A move, and the stance of the demonstration that it leads to.
+
+    Attributes:
+        stance: Index of the stance in the sequence; `target` is it.
+        move: What changes.
+        hints: Postures (nq,) found while mending earlier contacts for its sake.
+    """
 
     stance: int
     target: Stance
     move: Move
+    hints: tuple[np.ndarray, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -103,10 +103,12 @@ def plan_steps(
             k += 1
             continue
         repairs += 1
-        for j, contact in better.items():
+        places, hint = better
+        steps[k] = replace(step, hints=(hint, *step.hints))
+        for j, contact in places.items():
             firm = replace(steps[done[j]].move, makes=contact, firm=True)
             steps[done[j]] = replace(steps[done[j]], move=firm)
-        j = min(better)
+        j = min(places)
         k = done[j]
         del keyframes[j + 1 :], paths[j:], done[j:]
         missed = {i: m for i, m in missed.items() if i < k}
@@ -152,13 +154,14 @@ def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
 
 def repair(
     ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
-) -> dict[int, Contact] | None:
+) -> tuple[dict[int, Contact], np.ndarray] | None:
     """Which earlier paths should have made their contacts elsewhere for `move` to work.
 
     Looks at one contact after the other, the last one first, and then at all at once.
 
     Returns:
-        By index of the path, the contact at its better place; None where none helps.
+        By index of the path, the contact at its better place, and the posture (nq,)
+        that `move` then goes through; None where none helps.
     """
     standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
     made: dict[str, int] = {}
@@ -169,7 +172,8 @@ def repair(
     for surfaces in (*([x] for x in made), list(made)):
         eased = eased_contacts(ik, keyframes[-1], move, surfaces)
         if eased is not None:
-            return {made[c.surface]: c for c in eased}
+            contacts, q = eased
+            return {made[c.surface]: c for c in contacts}, q
     return None
 
 
@@ -215,34 +219,37 @@ def _plan_on(
         directions=step.target.posture,
     )
     if move.firm and move.makes:
-        key = _keyframe_there(ik, task, move.makes, before.q, method, options)
+        key = _keyframe_there(ik, task, move.makes, step, before.q, method, options)
     else:
         key = METHODS[method](ik, task, before.q, options)
     lap("keyframes")
-    result = _best_margin(ik, before, key, move, lap)
+    result = _best_margin(ik, before, key, step, lap)
     if isinstance(result, str) and move.makes:
         # Put the contact where the unloaded robot reaches it, and optimise around that.
         wanted = next(c for c in key.stance if c.surface == move.makes.surface)
-        there = _keyframe_there(ik, task, wanted, before.q, method, options)
+        there = _keyframe_there(ik, task, wanted, step, before.q, method, options)
         key = replace(
             there,
             cost_before=key.cost_before,
             iterations=key.iterations + there.iterations,
         )
         lap("keyframes")
-        result = _best_margin(ik, before, key, move, lap)
+        result = _best_margin(ik, before, key, step, lap)
     return result if isinstance(result, str) else (key, result)
 
 
 def _best_margin(
-    ik: IK, before: Keyframe, key: Keyframe, move: Move, lap: Callable[[str], None]
+    ik: IK, before: Keyframe, key: Keyframe, step: Step, lap: Callable[[str], None]
 ) -> Path | str:
     """The path with the largest of `MARGINS` for which there is one, or why not."""
+    move = step.move
     if key.status is not Status.SOLVED:
         return f"{move}: {key.status.value}"
     reason = ""
     for margin in MARGINS:
-        transition = plan_transition(ik, before, key, move, margin=margin)
+        transition = plan_transition(
+            ik, before, key, move, margin=margin, hints=step.hints
+        )
         lap("transitions")
         if transition.status is not Status.SOLVED:
             reason = f"{move}: {transition.status.value}"
@@ -259,12 +266,13 @@ def _keyframe_there(
     ik: IK,
     task: KeyframeTask,
     wanted: Contact,
+    step: Step,
     q: np.ndarray,
     method: str,
     options: KeyframeOptions,
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
-    contact, solution = approach_contact(ik, task.held, wanted, q)
+    contact, solution = approach_contact(ik, task.held, wanted, q, step.hints)
     fixed = replace(task, new=(contact,), fixed=True)
     key = direct.optimise(ik, fixed, solution.q, options)
     return replace(key, method=method)

@@ -8,7 +8,7 @@ centre of mass inside the ellipse of the remaining contacts (4.28).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -165,7 +165,13 @@ def balance_problem(
 
 
 def plan_transition(
-    ik: IK, before: Keyframe, after: Keyframe, move: Move, *, margin: float
+    ik: IK,
+    before: Keyframe,
+    after: Keyframe,
+    move: Move,
+    *,
+    margin: float,
+    hints: Sequence[np.ndarray] = (),
 ) -> Transition:
     """Shift, touch and settle between two keyframes.
 
@@ -175,6 +181,7 @@ def plan_transition(
         after: Keyframe it leads to.
         move: What changes between them.
         margin: Of the centre of mass to the border of its polygon [m].
+        hints: Postures (nq,) in which a similar shift or touch works.
     """
     world = ik.world
     new = move.makes.surface if move.makes is not None else None
@@ -187,13 +194,14 @@ def plan_transition(
             world, held=held, closed=rolling, q_reference=before.q, margin=margin
         ),
         before.q,
+        hints=hints,
     )
     solutions, touching = [shift], after.q
     if move.makes is not None:
         made = next(c for c in after.stance if c.surface == move.makes.surface)
         move = replace(move, makes=made)
         if shift.status is Status.SOLVED:
-            touch = _touch(ik, held, made, shift.q, after.q, margin)
+            touch = _touch(ik, held, made, shift.q, after.q, margin, hints)
             solutions.append(touch)
             touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
@@ -220,6 +228,7 @@ def _touch(
     shifted: np.ndarray,
     after: np.ndarray,
     margin: float,
+    hints: Sequence[np.ndarray],
 ) -> Solution:
     """Close the new contact from the loaded posture, the weight still on the rest."""
     world, kin = ik.world, ik.kin
@@ -235,12 +244,12 @@ def _touch(
         margin=margin,
     )
     problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
-    return ik.solve_hard(problem, after)
+    return ik.solve_hard(problem, after, hints=hints)
 
 
 def eased_contacts(
     ik: IK, before: Keyframe, move: Move, surfaces: Collection[str]
-) -> tuple[Contact, ...] | None:
+) -> tuple[tuple[Contact, ...], np.ndarray] | None:
     """Where earlier contacts should have been for a move to work.
 
     Solves the move's weight shift with these contacts free on their supports; where
@@ -253,7 +262,8 @@ def eased_contacts(
         surfaces: Whose contacts are free.
 
     Returns:
-        The contacts at their better places; None where that does not help either.
+        The contacts at their better places, and the posture (nq,) found with them; None
+        where that does not help either.
     """
     held = tuple(
         c for c in before.stance if c.surface not in {*move.breaks, *surfaces}
@@ -294,7 +304,7 @@ def eased_contacts(
             np.linalg.norm(a.position - b.position) > MOVED
             for a, b in zip(eased, moved, strict=True)
         ):
-            return eased
+            return eased, solution.q
     return None
 
 
@@ -314,14 +324,21 @@ def _free_goal(
 
 
 def _touching_at(ik: IK, c: Contact) -> Contact:
-    """The contact where its surface touches the support at the present posture."""
+    """The contact where its surface touches the support at the present posture.
+
+    It has not rolled: the posture in which it is made is yet to be found.
+    """
     support = ik.world.supports[c.support]
     p = ik.kin.contact_point(c.surface, support.normal)
-    return replace(c, position=support.project(p))
+    return replace(c, position=support.project(p), link=None)
 
 
 def approach_contact(
-    ik: IK, held: tuple[Contact, ...], wanted: Contact, q: np.ndarray
+    ik: IK,
+    held: tuple[Contact, ...],
+    wanted: Contact,
+    q: np.ndarray,
+    hints: Sequence[np.ndarray] = (),
 ) -> tuple[Contact, Solution]:
     """The nearest contact to `wanted` that closes while the others bear the weight.
 
@@ -330,6 +347,7 @@ def approach_contact(
         held: Contacts that stay.
         wanted: Where the contact would be liked.
         q: (nq,) to start from.
+        hints: Postures (nq,) in which a similar contact closes.
     """
     problem = balance_problem(
         ik.world,
@@ -338,6 +356,6 @@ def approach_contact(
         extra=(_free_goal(ik, wanted, APPROACH_WEIGHT, loaded=False),),
         touching={wanted.surface: wanted.support},
     )
-    solution = ik.solve_hard(problem, q)
+    solution = ik.solve_hard(problem, q, hints=hints)
     ik.kin.update(solution.q)
     return _touching_at(ik, wanted), solution

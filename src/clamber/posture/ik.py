@@ -20,7 +20,7 @@ Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -447,29 +447,39 @@ class IK:
                 break
         return n, converged, q, qp
 
-    def solve_hard(self, problem: PostureProblem, q: np.ndarray) -> Solution:
+    def solve_hard(
+        self,
+        problem: PostureProblem,
+        q: np.ndarray,
+        *,
+        hints: Sequence[np.ndarray] = (),
+    ) -> Solution:
         """`solve` for postures far from `q`, with more than one way to get there.
 
         Distances make the problem non-convex: from `q`, a limb may be on the wrong side
-        of an edge. Where the straight way stalls, the solve is tried again from where
-        it stalled, and from the posture that would do if nothing could collide.
+        of an edge. Where the straight way stalls, the solve is tried again from the
+        hints, from where it stalled, and from the posture that would do if nothing
+        could collide.
+
+        Args:
+            problem: What is wanted.
+            q: (nq,) to start from.
+            hints: Postures (nq,) that solve a similar problem.
         """
-        first = self.solve(problem, q)
-        if first.status is Status.SOLVED:
-            return first
-        ghost = replace(problem, clearance=np.full(len(problem.clearance), -np.inf))
-        best, iterations = first, first.iterations
-        for start in (first.q, None):
+        best = self.solve(problem, q)
+        iterations = best.iterations
+        for start in (*hints, best.q, None):
+            if best.status is Status.SOLVED:
+                break
             if start is None:
-                free = self.solve(ghost, q)
+                nothing = np.full(len(problem.clearance), -np.inf)
+                free = self.solve(replace(problem, clearance=nothing), q)
                 iterations += free.iterations
                 start = free.q
             trial = self.solve(problem, start)
             iterations += trial.iterations
             if trial.residuals.worst < best.residuals.worst:
                 best = trial
-            if best.status is Status.SOLVED:
-                break
         return replace(best, iterations=iterations)
 
     def residuals(self, problem: PostureProblem, q: np.ndarray) -> Residuals:
