@@ -35,19 +35,34 @@ class Move:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Guide:
+    """Postures (nq,) near those that a move goes through, as far as they are known.
+
+    Attributes:
+        shifted: The weight on the contacts that stay.
+        touching: The new contact closed, not loaded.
+        after: It bears load.
+    """
+
+    shifted: np.ndarray | None = None
+    touching: np.ndarray | None = None
+    after: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Step:
     """A move, and the stance of the demonstration that it leads to.
 
     Attributes:
         stance: Index of the stance in the sequence; `target` is it.
         move: What changes.
-        hints: Postures (nq,) found while mending earlier contacts for its sake.
+        guide: Where its postures may be found.
     """
 
     stance: int
     target: Stance
     move: Move
-    hints: tuple[np.ndarray, ...] = ()
+    guide: Guide = Guide()
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import Status
-from clamber.moves import Move, Skipped, Step
+from clamber.moves import Guide, Move, Skipped, Step
 from clamber.path import Path, plan_path
 from clamber.posture import direct, gradient, lbfgs
 from clamber.posture.ik import IK, support_rotation
@@ -103,8 +103,8 @@ def plan_steps(
             k += 1
             continue
         repairs += 1
-        places, hint = better
-        steps[k] = replace(step, hints=(hint, *step.hints))
+        places, guide = better
+        steps[k] = replace(step, guide=guide)
         for j, contact in places.items():
             firm = replace(steps[done[j]].move, makes=contact, firm=True)
             steps[done[j]] = replace(steps[done[j]], move=firm)
@@ -115,6 +115,37 @@ def plan_steps(
     return Found(
         keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed.values())
     )
+
+
+def guided_steps(steps: Sequence[Step], found: Found, rise: float) -> tuple[Step, ...]:
+    """Steps that follow what was found for lower boxes.
+
+    Args:
+        steps: To plan.
+        found: A path for each of them, over boxes that are lower by `rise` [m].
+        rise: [m]
+    """
+
+    def raised(q: np.ndarray) -> np.ndarray:
+        out = q.copy()
+        out[2] += rise
+        return out
+
+    out = []
+    for step, path in zip(steps, found.paths, strict=True):
+        t, move = path.transition, step.move
+        if t.move.makes is not None and move.makes is not None:
+            p = t.move.makes.position.copy()
+            p[2] = move.makes.position[2]
+            made = replace(move.makes, position=p)
+            move = replace(move, makes=made, firm=t.move.firm)
+        guide = Guide(
+            shifted=raised(t.shifted),
+            touching=raised(t.touching),
+            after=raised(t.after),
+        )
+        out.append(replace(step, move=move, guide=guide))
+    return tuple(out)
 
 
 def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
@@ -154,14 +185,14 @@ def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
 
 def repair(
     ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
-) -> tuple[dict[int, Contact], np.ndarray] | None:
+) -> tuple[dict[int, Contact], Guide] | None:
     """Which earlier paths should have made their contacts elsewhere for `move` to work.
 
     Looks at one contact after the other, the last one first, and then at all at once.
 
     Returns:
-        By index of the path, the contact at its better place, and the posture (nq,)
-        that `move` then goes through; None where none helps.
+        By index of the path, the contact at its better place, and the posture that
+        `move` then goes through; None where none helps.
     """
     standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
     made: dict[str, int] = {}
@@ -172,8 +203,8 @@ def repair(
     for surfaces in (*([x] for x in made), list(made)):
         eased = eased_contacts(ik, keyframes[-1], move, surfaces)
         if eased is not None:
-            contacts, q = eased
-            return {made[c.surface]: c for c in contacts}, q
+            contacts, guide = eased
+            return {made[c.surface]: c for c in contacts}, guide
     return None
 
 
@@ -218,24 +249,25 @@ def _plan_on(
         q_reference=before.q,
         directions=step.target.posture,
     )
-    if move.firm and move.makes:
-        key = _keyframe_there(ik, task, move.makes, step, before.q, method, options)
-    else:
-        key = METHODS[method](ik, task, before.q, options)
-    lap("keyframes")
-    result = _best_margin(ik, before, key, step, lap)
-    if isinstance(result, str) and move.makes:
-        # Put the contact where the unloaded robot reaches it, and optimise around that.
-        wanted = next(c for c in key.stance if c.surface == move.makes.surface)
-        there = _keyframe_there(ik, task, wanted, step, before.q, method, options)
-        key = replace(
-            there,
-            cost_before=key.cost_before,
-            iterations=key.iterations + there.iterations,
-        )
+    start = before.q if step.guide.after is None else step.guide.after
+    wanted, result = move.makes, "nothing tried"
+    for there in (True, False) if move.firm else (False, True):
+        if wanted is not None and there:
+            # Put the contact where the unloaded robot reaches it.
+            key = _keyframe_there(ik, task, wanted, step, before.q, method, options)
+        else:
+            key = METHODS[method](ik, task, start, options)
+            if move.makes is not None:
+                wanted = next(
+                    c for c in key.stance if c.surface == move.makes.surface
+                )
         lap("keyframes")
         result = _best_margin(ik, before, key, step, lap)
-    return result if isinstance(result, str) else (key, result)
+        if not isinstance(result, str):
+            return key, result
+        if move.makes is None:
+            break
+    return result
 
 
 def _best_margin(
@@ -248,7 +280,7 @@ def _best_margin(
     reason = ""
     for margin in MARGINS:
         transition = plan_transition(
-            ik, before, key, move, margin=margin, hints=step.hints
+            ik, before, key, move, margin=margin, guide=step.guide
         )
         lap("transitions")
         if transition.status is not Status.SOLVED:
@@ -272,7 +304,9 @@ def _keyframe_there(
     options: KeyframeOptions,
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
-    contact, solution = approach_contact(ik, task.held, wanted, q, step.hints)
+    guide = step.guide
+    contact, solution = approach_contact(ik, task.held, wanted, q, guide.touching)
     fixed = replace(task, new=(contact,), fixed=True)
-    key = direct.optimise(ik, fixed, solution.q, options)
+    start = solution.q if guide.after is None else guide.after
+    key = direct.optimise(ik, fixed, start, options)
     return replace(key, method=method)

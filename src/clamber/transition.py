@@ -8,7 +8,7 @@ centre of mass inside the ellipse of the remaining contacts (4.28).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import World
-from clamber.moves import Move
+from clamber.moves import Guide, Move
 from clamber.posture.ik import (
     IK,
     ContactGoal,
@@ -171,7 +171,7 @@ def plan_transition(
     move: Move,
     *,
     margin: float,
-    hints: Sequence[np.ndarray] = (),
+    guide: Guide | None = None,
 ) -> Transition:
     """Shift, touch and settle between two keyframes.
 
@@ -181,9 +181,9 @@ def plan_transition(
         after: Keyframe it leads to.
         move: What changes between them.
         margin: Of the centre of mass to the border of its polygon [m].
-        hints: Postures (nq,) in which a similar shift or touch works.
+        guide: Where its postures may be found.
     """
-    world = ik.world
+    world, guide = ik.world, guide or Guide()
     new = move.makes.surface if move.makes is not None else None
     held = tuple(c for c in after.stance if c.surface != new)
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
@@ -194,14 +194,14 @@ def plan_transition(
             world, held=held, closed=rolling, q_reference=before.q, margin=margin
         ),
         before.q,
-        hints=hints,
+        hint=guide.shifted,
     )
     solutions, touching = [shift], after.q
     if move.makes is not None:
         made = next(c for c in after.stance if c.surface == move.makes.surface)
         move = replace(move, makes=made)
         if shift.status is Status.SOLVED:
-            touch = _touch(ik, held, made, shift.q, after.q, margin, hints)
+            touch = _touch(ik, held, made, shift.q, after.q, margin, guide.touching)
             solutions.append(touch)
             touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
@@ -228,7 +228,7 @@ def _touch(
     shifted: np.ndarray,
     after: np.ndarray,
     margin: float,
-    hints: Sequence[np.ndarray],
+    hint: np.ndarray | None,
 ) -> Solution:
     """Close the new contact from the loaded posture, the weight still on the rest."""
     world, kin = ik.world, ik.kin
@@ -244,12 +244,12 @@ def _touch(
         margin=margin,
     )
     problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
-    return ik.solve_hard(problem, after, hints=hints)
+    return ik.solve_hard(problem, after, hint=hint)
 
 
 def eased_contacts(
     ik: IK, before: Keyframe, move: Move, surfaces: Collection[str]
-) -> tuple[tuple[Contact, ...], np.ndarray] | None:
+) -> tuple[tuple[Contact, ...], Guide] | None:
     """Where earlier contacts should have been for a move to work.
 
     Solves the move's weight shift with these contacts free on their supports; where
@@ -262,12 +262,10 @@ def eased_contacts(
         surfaces: Whose contacts are free.
 
     Returns:
-        The contacts at their better places, and the posture (nq,) found with them; None
-        where that does not help either.
+        The contacts at their better places, and the posture found with them; None where
+        that does not help either.
     """
-    held = tuple(
-        c for c in before.stance if c.surface not in {*move.breaks, *surfaces}
-    )
+    held = tuple(c for c in before.stance if c.surface not in {*move.breaks, *surfaces})
     moved = tuple(c for c in before.stance if c.surface in surfaces)
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
     middle = np.mean([c.position for c in (*held, *moved)], axis=0)
@@ -282,19 +280,17 @@ def eased_contacts(
         extra=free,
         touching=touching,
     )
-    problems = [shift]
+    problems = {"shifted": shift}
     if move.makes is not None:
         new, at = move.makes, move.makes.position
-        problems.append(
-            balance_problem(
-                ik.world,
-                held=tuple(rolled(ik, before.q, c, at) for c in held),
-                q_reference=before.q,
-                extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
-                touching=touching | {new.surface: new.support},
-            )
+        problems["touching"] = balance_problem(
+            ik.world,
+            held=tuple(rolled(ik, before.q, c, at) for c in held),
+            q_reference=before.q,
+            extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
+            touching=touching | {new.surface: new.support},
         )
-    for problem in problems:
+    for posture, problem in problems.items():
         solution = ik.solve_hard(problem, before.q)
         if solution.status is not Status.SOLVED:
             return None
@@ -304,7 +300,7 @@ def eased_contacts(
             np.linalg.norm(a.position - b.position) > MOVED
             for a, b in zip(eased, moved, strict=True)
         ):
-            return eased, solution.q
+            return eased, Guide(**{posture: solution.q})
     return None
 
 
@@ -338,7 +334,7 @@ def approach_contact(
     held: tuple[Contact, ...],
     wanted: Contact,
     q: np.ndarray,
-    hints: Sequence[np.ndarray] = (),
+    hint: np.ndarray | None = None,
 ) -> tuple[Contact, Solution]:
     """The nearest contact to `wanted` that closes while the others bear the weight.
 
@@ -347,7 +343,7 @@ def approach_contact(
         held: Contacts that stay.
         wanted: Where the contact would be liked.
         q: (nq,) to start from.
-        hints: Postures (nq,) in which a similar contact closes.
+        hint: (nq,) a posture in which a similar contact closes.
     """
     problem = balance_problem(
         ik.world,
@@ -356,6 +352,6 @@ def approach_contact(
         extra=(_free_goal(ik, wanted, APPROACH_WEIGHT, loaded=False),),
         touching={wanted.surface: wanted.support},
     )
-    solution = ik.solve_hard(problem, q, hints=hints)
+    solution = ik.solve_hard(problem, q, hint=hint)
     ik.kin.update(solution.q)
     return _touching_at(ik, wanted), solution

@@ -20,7 +20,7 @@ Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -452,23 +452,22 @@ class IK:
         problem: PostureProblem,
         q: np.ndarray,
         *,
-        hints: Sequence[np.ndarray] = (),
+        hint: np.ndarray | None = None,
     ) -> Solution:
         """`solve` for postures far from `q`, with more than one way to get there.
 
         Distances make the problem non-convex: from `q`, a limb may be on the wrong side
-        of an edge. Where the straight way stalls, the solve is tried again from the
-        hints, from where it stalled, and from the posture that would do if nothing
-        could collide.
+        of an edge. Where the straight way stalls, the solve is tried again from where
+        it stalled, and from the posture that would do if nothing could collide.
 
         Args:
             problem: What is wanted.
             q: (nq,) to start from.
-            hints: Postures (nq,) that solve a similar problem.
+            hint: (nq,) a posture that solves a similar problem, tried first.
         """
-        best = self.solve(problem, q)
+        best = self.solve(problem, q if hint is None else hint)
         iterations = best.iterations
-        for start in (*hints, best.q, None):
+        for start in (best.q, None) if hint is None else (q, best.q, None):
             if best.status is Status.SOLVED:
                 break
             if start is None:
