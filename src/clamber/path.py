@@ -205,9 +205,7 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
             hard=False,
             reference=LOOSE_ARC_WEIGHT if between else ARC_WEIGHT,
         )
-        reference = (
-            last if between else interpolate(kin, t.shifted, t.touching, share)
-        )
+        reference = last if between else interpolate(kin, t.shifted, t.touching, share)
         problem = balance_problem(
             world,
             held=t.held,

@@ -111,10 +111,15 @@ def plan(
     clock.lap("retarget")
 
     steps, skipped = split_moves(goal, world)
-    found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
+    found, used = search_steps(
+        ik, steps, options, variations=({},), lap=clock.lap, report=report
+    )
     if found.missed:
         above = _from_below(sequence, world, steps, options, clock.lap, report)
-        found = found if above is None else above
+        if above is not None:
+            found = above
+        else:
+            found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
     trajectory = None
     if found.paths:
         report("trajectory", 1.0, "")
@@ -142,6 +147,7 @@ def search_steps(
     steps: Sequence[Step],
     options: PlanOptions,
     *,
+    variations: Sequence[dict[str, float]] = VARIATIONS,
     start: Keyframe | None = None,
     lap: Callable[[str], None] = lambda stage: None,
     report: Progress = lambda stage, share, note: None,
@@ -151,13 +157,14 @@ def search_steps(
     Args:
         ik: Workspace.
         steps: To plan, in order.
-        options: Of the plan; `VARIATIONS` of its weights are tried where it is stuck.
+        options: Of the plan.
+        variations: Factors of its weights, the next ones tried where it is stuck.
         start: The keyframe to begin from; None: both feet where the robot starts.
         lap: Called with the stage that has just ended, for timing.
         report: Called with stage, share and note, for progress.
     """
     found, used = None, options
-    for factors in VARIATIONS:
+    for factors in variations:
         weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
         varied = replace(options, keyframe=replace(options.keyframe, **weights))
         trial = plan_steps(

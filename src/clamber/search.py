@@ -258,9 +258,7 @@ def _plan_on(
         else:
             key = METHODS[method](ik, task, start, options)
             if move.makes is not None:
-                wanted = next(
-                    c for c in key.stance if c.surface == move.makes.surface
-                )
+                wanted = next(c for c in key.stance if c.surface == move.makes.surface)
         lap("keyframes")
         result = _best_margin(ik, before, key, step, lap)
         if not isinstance(result, str):

@@ -385,7 +385,7 @@ class IK:
         heavy = PENALTY * qp.C.T
         H, c = qp.H + heavy @ qp.C, qp.c - heavy @ np.clip(qp.e, -reach, reach)
         x, _, flag, _ = daqp.solve(H, c, qp.A, hi, lo, qp.sense, rho_soft=1.0 / PENALTY)
-        return x if flag > 0 else np.zeros(nv)
+        return np.clip(x, lo[:nv], hi[:nv]) if flag > 0 else np.zeros(nv)
 
     def solve(
         self,
