@@ -41,12 +41,10 @@ class Guide:
     Attributes:
         shifted: The weight on the contacts that stay.
         touching: The new contact closed, not loaded.
-        after: It bears load.
     """
 
     shifted: np.ndarray | None = None
     touching: np.ndarray | None = None
-    after: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -21,7 +21,7 @@ from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
 from clamber.scene import Scene
-from clamber.search import Found, guided_steps, plan_steps, standing
+from clamber.search import Found, plan_steps, standing
 from clamber.trajectory import Trajectory, build_trajectory
 
 Method = Literal["direct", "lbfgs", "gradient"]
@@ -34,9 +34,6 @@ VARIATIONS: tuple[dict[str, float], ...] = (
     {"reference_weight": 2.0},
     {"reference_weight": 0.5},
 )
-LOWERING = 0.06  # share of the boxes' heights by which they are lowered at a time
-LOWEST = 0.8  # share below which no way is looked for
-RISE = 0.01  # share of the height; shorter steps up are not tried
 Progress = Callable[[str, float, str], None]
 
 
@@ -111,15 +108,7 @@ def plan(
     clock.lap("retarget")
 
     steps, skipped = split_moves(goal, world)
-    found, used = search_steps(
-        ik, steps, options, variations=({},), lap=clock.lap, report=report
-    )
-    if found.missed:
-        above = _from_below(sequence, world, steps, options, clock.lap, report)
-        if above is not None:
-            found = above
-        else:
-            found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
+    found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
     trajectory = None
     if found.paths:
         report("trajectory", 1.0, "")
@@ -147,7 +136,6 @@ def search_steps(
     steps: Sequence[Step],
     options: PlanOptions,
     *,
-    variations: Sequence[dict[str, float]] = VARIATIONS,
     start: Keyframe | None = None,
     lap: Callable[[str], None] = lambda stage: None,
     report: Progress = lambda stage, share, note: None,
@@ -157,14 +145,13 @@ def search_steps(
     Args:
         ik: Workspace.
         steps: To plan, in order.
-        options: Of the plan.
-        variations: Factors of its weights, the next ones tried where it is stuck.
+        options: Of the plan; `VARIATIONS` of its weights are tried where it is stuck.
         start: The keyframe to begin from; None: both feet where the robot starts.
         lap: Called with the stage that has just ended, for timing.
         report: Called with stage, share and note, for progress.
     """
     found, used = None, options
-    for factors in variations:
+    for factors in VARIATIONS:
         weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
         varied = replace(options, keyframe=replace(options.keyframe, **weights))
         trial = plan_steps(
@@ -182,49 +169,6 @@ def search_steps(
             break
     assert found is not None
     return found, used
-
-
-def _from_below(
-    sequence: ContactSequence,
-    world: World,
-    steps: Sequence[Step],
-    options: PlanOptions,
-    lap: Callable[[str], None],
-    report: Progress,
-) -> Found | None:
-    """A way over boxes that are too high for the search, by way of lower ones.
-
-    Boxes are lowered until there is a way, which then guides the search over higher
-    ones. Returns None where that leads nowhere.
-    """
-
-    def search(share: float, guide: tuple[Found, float] | None) -> Found | None:
-        there = build_world(world.robot, world.scene.lowered(share))
-        moves, _ = split_moves(retarget(sequence, there), there)
-        if [str(s.move) for s in moves] != [str(s.move) for s in steps]:
-            return None
-        if guide is not None:
-            found, below = guide
-            rise = (share - below) * max(b.top.position[2] for b in world.scene.boxes)
-            moves = guided_steps(moves, found, rise)
-        found = plan_steps(
-            IK(there), moves, options.method, options.keyframe, lap=lap, report=report
-        )
-        return None if found.missed else found
-
-    share, found = 1.0, None
-    while found is None and share > LOWEST:
-        share -= LOWERING
-        found = search(share, None)
-    step = 1.0 - share
-    while found is not None and share < 1.0 and step > RISE:
-        higher = min(share + step, 1.0)
-        trial = search(higher, (found, share))
-        if trial is None:
-            step *= 0.5
-        else:
-            found, share = trial, higher
-    return found if share == 1.0 else None
 
 
 class _Clock:

@@ -7,7 +7,7 @@ normal; its convex polygon is given in that frame's x and y, counter-clockwise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -179,18 +179,6 @@ class Scene:
         raise KeyError(
             f"no support {name!r}; there are {[s.name for s in self.supports]}"
         )
-
-    def lowered(self, share: float) -> Scene:
-        """The same with every box's heights times `share`."""
-        boxes = tuple(
-            replace(
-                b,
-                size=b.size * [1.0, 1.0, share],
-                position=b.position * [1.0, 1.0, share],
-            )
-            for b in self.boxes
-        )
-        return replace(self, boxes=boxes)
 
     @classmethod
     def from_height(cls, height: float, friction: float = 0.8) -> Scene:

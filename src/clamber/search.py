@@ -117,37 +117,6 @@ def plan_steps(
     )
 
 
-def guided_steps(steps: Sequence[Step], found: Found, rise: float) -> tuple[Step, ...]:
-    """Steps that follow what was found for lower boxes.
-
-    Args:
-        steps: To plan.
-        found: A path for each of them, over boxes that are lower by `rise` [m].
-        rise: [m]
-    """
-
-    def raised(q: np.ndarray) -> np.ndarray:
-        out = q.copy()
-        out[2] += rise
-        return out
-
-    out = []
-    for step, path in zip(steps, found.paths, strict=True):
-        t, move = path.transition, step.move
-        if t.move.makes is not None and move.makes is not None:
-            p = t.move.makes.position.copy()
-            p[2] = move.makes.position[2]
-            made = replace(move.makes, position=p)
-            move = replace(move, makes=made, firm=t.move.firm)
-        guide = Guide(
-            shifted=raised(t.shifted),
-            touching=raised(t.touching),
-            after=raised(t.after),
-        )
-        out.append(replace(step, move=move, guide=guide))
-    return tuple(out)
-
-
 def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
     """The first keyframe: both feet where the robot starts."""
     world, kin = ik.world, ik.kin
@@ -249,14 +218,13 @@ def _plan_on(
         q_reference=before.q,
         directions=step.target.posture,
     )
-    start = before.q if step.guide.after is None else step.guide.after
     wanted, result = move.makes, "nothing tried"
     for there in (True, False) if move.firm else (False, True):
         if wanted is not None and there:
             # Put the contact where the unloaded robot reaches it.
             key = _keyframe_there(ik, task, wanted, step, before.q, method, options)
         else:
-            key = METHODS[method](ik, task, start, options)
+            key = METHODS[method](ik, task, before.q, options)
             if move.makes is not None:
                 wanted = next(c for c in key.stance if c.surface == move.makes.surface)
         lap("keyframes")
@@ -302,9 +270,7 @@ def _keyframe_there(
     options: KeyframeOptions,
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
-    guide = step.guide
-    contact, solution = approach_contact(ik, task.held, wanted, q, guide.touching)
+    contact, solution = approach_contact(ik, task.held, wanted, q, step.guide.touching)
     fixed = replace(task, new=(contact,), fixed=True)
-    start = solution.q if guide.after is None else guide.after
-    key = direct.optimise(ik, fixed, start, options)
+    key = direct.optimise(ik, fixed, solution.q, options)
     return replace(key, method=method)
