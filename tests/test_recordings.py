@@ -184,6 +184,25 @@ def bvh_text(demo: Demonstration, p: np.ndarray, order: str) -> str:
     return text + "".join(" ".join(f"{v:.6f}" for v in row) + "\n" for row in rows)
 
 
+def smpl_joints(demo: Demonstration, joints: int) -> np.ndarray:
+    """(T, joints, 3) in the order of SMPL's joints; those it lacks are the pelvis."""
+    p = np.zeros((len(demo.t), joints, 3))
+    order = (
+        "Pelvis LHip RHip . LKnee RKnee . LFoot RFoot . LFoot.toe RFoot.toe Neck . . "
+        "Head LShoulder RShoulder LElbow RElbow LHand RHand"
+    ).split()
+    for k, n in enumerate(order):
+        p[:, k] = demo.point("Pelvis" if n == "." else n)
+    for s, side in enumerate("LR"):
+        if joints == 24:
+            p[:, 22 + s] = demo.point(side + "Hand.knuckle")
+        if joints == 55:
+            fingers = slice(25 + 15 * s, 40 + 15 * s)
+            p[:, fingers] = demo.point(side + "Hand.knuckle")[:, None]
+            p[:, 30 + 15 * s] = demo.point(side + "Hand.tip")  # middle3
+    return p
+
+
 def skin_markers(demo: Demonstration) -> tuple[list[str], np.ndarray]:
     """Plug-in Gait's markers on the person's skin, from the true joint centres."""
     at = {n: demo.point(n) for n in demo.names}
@@ -463,20 +482,7 @@ def test_of_two_people_one_must_be_named():
 @pytest.mark.parametrize(("joints", "name"), [(22, "SMPL"), (24, "SMPL"), (55, "SMPL")])
 def test_smpl_joints_need_no_names(tmp_path, joints, name):
     demo, truth = climb(gaps=0)
-    p = np.zeros((len(demo.t), joints, 3))
-    order = (
-        "Pelvis LHip RHip . LKnee RKnee . LFoot RFoot . LFoot.toe RFoot.toe Neck . . "
-        "Head LShoulder RShoulder LElbow RElbow LHand RHand"
-    ).split()
-    for k, n in enumerate(order):
-        p[:, k] = demo.point("Pelvis" if n == "." else n)
-    for s, side in enumerate("LR"):
-        if joints == 24:
-            p[:, 22 + s] = demo.point(side + "Hand.knuckle")
-        if joints == 55:
-            fingers = slice(25 + 15 * s, 40 + 15 * s)
-            p[:, fingers] = demo.point(side + "Hand.knuckle")[:, None]
-            p[:, 30 + 15 * s] = demo.point(side + "Hand.tip")  # middle3
+    p = smpl_joints(demo, joints)
     np.savez(tmp_path / "smpl.npz", joints=from_z_up(p, "y"), fps=120)
     back = load_demo(tmp_path / "smpl.npz", scene=demo.scene)
     assert name in back.notes[0]
@@ -487,6 +493,7 @@ def test_names_that_come_twice_are_told_apart():
     assert unique_names(["a", "b", "a", "a (2)", "a"]) == (
         "a", "b", "a (3)", "a (2)", "a (4)",
     )  # fmt: skip
+    assert unique_names(["a\nb", "\x00c"]) == ("a?b", "?c")
 
 
 # What recording.yaml says.

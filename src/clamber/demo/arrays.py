@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from clamber.demo.points import MAX_POINTS, Points
+from clamber.demo.points import MAX_POINTS, Points, unique_names
 from clamber.errors import InputError
 
 NPY_MAGIC, NPZ_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
@@ -110,7 +110,7 @@ def read_array(
         raise InputError("different names", source=path, field="names", value=twice)
     if raw.dtype.kind != "f":
         raw = raw.astype(np.float32)
-    return Points(names=tuple(names), position=raw, rate=rate)
+    return Points(names=unique_names(names), position=raw, rate=rate)
 
 
 def _read_npy(file: BinaryIO, size: int, path: Path, member: str = "") -> np.ndarray:

@@ -114,7 +114,11 @@ def unit_of(word: str, source: Path, field: str) -> float:
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The names, those that come again numbered: two points may not share one."""
+    """The names as one may print them, those that come again numbered.
+
+    Two points may not share a name, and a name is no place for line ends.
+    """
+    names = ["".join(c if c.isprintable() else "?" for c in n) for n in names]
     taken = set(names)
     count: dict[str, int] = {}
     out: list[str] = []

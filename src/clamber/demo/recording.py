@@ -213,11 +213,12 @@ def _build(
         else:
             parts[part] = what
     found = recognise(labels, parts=parts, subject=said.subject, source=path)
-    raw = {
-        c: points.position[first:last, c].astype(float)
-        for c in found.used()
-        if c not in fixed
-    }
+    with np.errstate(invalid="ignore"):  # NaN of any kind
+        raw = {
+            c: points.position[first:last, c].astype(float)
+            for c in found.used()
+            if c not in fixed
+        }
     unit, why_unit = _unit(said, points, found, raw, path)
     for column, what in fixed.items():
         raw[column] = _fixed(points, what, unit, path)[first:last]
