@@ -219,6 +219,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         complete=True,
         trajectory="timed",
     )
+    event = clamber.Event(time=7.25, text="LHand touches 30 mm below")
     criterion = SimpleNamespace(value=0.0123, limit=0.05, ok=True)
     verdict = SimpleNamespace(reached=True, criteria={"speed [m/s]": criterion})
     s = SimpleNamespace(
@@ -248,7 +249,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         "load_sequence": sequence,
         "load_plan": plan,
         "plan": plan,
-        "simulate": "rollout",
+        "simulate": SimpleNamespace(events=(event,), stopped=""),
         "judge": verdict,
         "render_run": [tmp_path / "run" / "video.mp4"],
     }.items():
@@ -564,7 +565,8 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
     assert record["complete"] is True
     assert [k["move"] for k in record["keyframes"]] == ["start", "air -> LHand on box"]
     assert record["keyframes"][1]["seconds"] > 0
-    assert cli.main(["simulate", str(run_folder), "--json"]) == 1
+    command = ["simulate", str(run_folder), "--controller", "pid", "--json"]
+    assert cli.main(command) == 1
     record = json.loads(capsys.readouterr().out)
     assert record["reached"] is False
     on_top = record["criteria"]["share of the weight at the end on obstacles"]
@@ -578,6 +580,7 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
         "scene.xml",
         "timings.json",
         "rollout.npz",
+        "execution.json",
         "verdict.json",
     }
     seconds = json.loads((run_folder / "timings.json").read_text())["seconds"]

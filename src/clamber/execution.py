@@ -527,7 +527,7 @@ class Execution:
                 key = (c.surface, self._next)
                 near = [
                     k
-                    for k, (s, x) in self._felt.items()
+                    for k, (_, x) in self._felt.items()
                     if k[0] == c.surface and np.linalg.norm(x[:2] - p[:2]) < 0.05
                 ]
                 self._felt[near[0] if near else key] = (c.support, p)
