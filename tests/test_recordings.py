@@ -312,7 +312,12 @@ def test_motive_bones_give_the_true_contacts(tmp_path, unit, word, parent):
 
 @pytest.mark.parametrize(
     ("order", "unit", "scale"),
-    [("ZXY", "cm", 100.0), ("XYZ", "m", 1.0), ("YZX", "inches", 1 / 0.0254)],
+    [
+        ("ZXY", "cm", 100.0),
+        ("XYZ", "m", 1.0),
+        ("YZX", "inches", 1 / 0.0254),
+        ("ZYX", "CMU's", 0.45 / 0.0254),
+    ],
 )
 def test_a_bvh_gives_the_true_contacts_whatever_its_order_of_angles(
     tmp_path, order, unit, scale
@@ -579,6 +584,21 @@ def test_a_file_is_known_by_its_content_where_its_name_says_nothing(tmp_path):
     (tmp_path / "take.json").write_text("{}")
     with pytest.raises(InputError, match="a recording"):
         load_demo(tmp_path / "take.json")
+
+
+def test_who_never_stands_up_does_not_turn_the_world(tmp_path):
+    """On all fours shoulders are far ahead of the ankles: up is up all the same."""
+    demo, _ = climb(gaps=0)
+    p = demo.position[demo.t > 17.0]
+    way = demo.point("LShoulder")[-1] - demo.point("LFoot")[-1]
+    assert way[0] > 1.5 * way[2]  # the case that might mislead
+    np.savez(tmp_path / "a.npz", positions=p, names=demo.names, rate=demo.rate)
+    back = load_demo(tmp_path / "a.npz")
+    assert "up: z (usual)" in back.notes[1]
+    y_up = from_z_up(p, "y")
+    np.savez(tmp_path / "a.npz", positions=y_up, names=demo.names, rate=demo.rate)
+    path = described(tmp_path, file="a.npz", up="y")
+    np.testing.assert_allclose(load_demo(path).position, back.position, atol=1e-12)
 
 
 @pytest.mark.parametrize("up", AXES)

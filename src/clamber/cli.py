@@ -261,7 +261,7 @@ class ClimbCommand:
             report("detect", 0.0, "")
             demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
             sequence = clamber.detect_contacts(demo)
-            report("detect", 1.0, "")
+            report("detect", 1.0, "; ".join(demo.notes[:1]))
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():

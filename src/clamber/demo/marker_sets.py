@@ -332,7 +332,7 @@ def _centres(at: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     left = _filled(_unit(at["LAsis"] - at["RAsis"]))
     hips = _hips(at)
     across = at["LAcromion"] - at["RAcromion"]
-    lower = 0.17 * _median_length(across)  # [Rab02]
+    lower = 0.17 * median_length(across)  # [Rab02]
     trunk = _unit((at["LAcromion"] + at["RAcromion"] - hips["L"] - hips["R"]) / 2)
     for s, sign in zip(SIDES, (1.0, -1.0), strict=True):
         out[f"{s}Hip"] = hips[s]
@@ -362,9 +362,9 @@ def _hips(at: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """
     front = (at["LAsis"] + at["RAsis"]) / 2
     left = _unit(at["LAsis"] - at["RAsis"])
-    width = _median_length(at["LAsis"] - at["RAsis"])
+    width = median_length(at["LAsis"] - at["RAsis"])
     forward = front - (at["LPsis"] + at["RPsis"]) / 2
-    depth = _median_length(forward)
+    depth = median_length(forward)
     up = _unit(np.cross(forward, left))
     forward = np.cross(left, up)
     middle = front - (0.24 * depth + 0.0099) * forward - (0.30 * width + 0.0109) * up
@@ -388,7 +388,7 @@ def _between(
         return (outer + at[f"{s}{joint}In"]) / 2
     bone = _unit(outer - above)
     way = _unit(inward - bone * np.sum(inward * bone, axis=1, keepdims=True))
-    half = _HALF_WIDTH[joint] * _median_length(outer - above) + MARKER_RADIUS
+    half = _HALF_WIDTH[joint] * median_length(outer - above) + MARKER_RADIUS
     return outer + half * way
 
 
@@ -397,7 +397,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.where(length > 0, length, np.nan)
 
 
-def _median_length(v: np.ndarray) -> float:
+def median_length(v: np.ndarray) -> float:
     """Median length of vectors (T, 3) where they are known; NaN where none is."""
     length = np.linalg.norm(v, axis=1)
     length = length[np.isfinite(length)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,6 +28,7 @@ from clamber.demo.levels import fit_levels
 from clamber.demo.marker_sets import (
     Recognised,
     known_point,
+    median_length,
     recognise,
     solve_centres,
 )
@@ -254,12 +256,18 @@ def _build(
 # Where a file does not say its unit the shank does: no two of these agree.
 _SHANK = (0.28, 0.56)  # [m] of a person's, from a small one's to a tall one's
 _GUESSES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254, "CMU's": 0.0254 / 0.45}
-_JOINTS = {"Knee": "KneeOut", "Foot": "AnkleOut", "Shoulder": "Acromion"}
+# Where there are markers on the skin instead of a joint.
+_ON_SKIN = {
+    "Foot": "AnkleOut",
+    "Knee": "KneeOut",
+    "Hip": "Asis",
+    "Shoulder": "Acromion",
+}
 
 
 def _columns(found: Recognised, point: str) -> tuple[int, ...]:
     """Columns near a canonical point, before any centre is computed."""
-    place = point[0] + _JOINTS[point[1:]]
+    place = point[0] + _ON_SKIN[point[1:]]
     return found.columns[point if point in found.columns else place]
 
 
@@ -304,7 +312,7 @@ def _unit(
     )
 
 
-_UPRIGHT = 0.9  # of the way from ankles to shoulders of a person who stands
+_UPRIGHT = 0.85  # of the length from ankles over knees and hips to shoulders: it stands
 
 
 def _up(
@@ -316,28 +324,28 @@ def _up(
     """The axis that points up, and who says so.
 
     Where nobody says, it is the usual one of the format, unless the person stands
-    along another one at some time, which is then it: shoulders over the ankles by
-    nearly all the length that they are ever apart.
+    straight along another one at some time and never along this: it is then that.
     """
     if said.up is not None:
         return said.up, "recording.yaml"
     if points.up is not None:
         return points.up, "the file"
     usual = points.usual_up
-    shoulder, ankle = (_near(found, raw, j) for j in ("Shoulder", "Foot"))
-    both = [s for s in SIDES if s in shoulder and s in ankle]
+    chain = [_near(found, raw, j) for j in ("Foot", "Knee", "Hip", "Shoulder")]
+    both = [s for s in SIDES if all(s in joint for joint in chain)]
     if both:
-        way = np.mean([shoulder[s] - ankle[s] for s in both], axis=0)
+        middle = [np.mean([joint[s] for s in both], axis=0) for joint in chain]
+        body = sum(median_length(b - a) for a, b in pairwise(middle))
+        way = middle[-1] - middle[0]
         way = way[np.isfinite(way).all(axis=1)]
         if len(way):
-            longest = np.percentile(np.linalg.norm(way, axis=1), 95)
             reach = {
                 sign + a: float(np.percentile((-1 if sign else 1) * way[:, k], 95))
                 for k, a in enumerate("xyz")
                 for sign in ("", "-")
             }
             best = max(reach, key=lambda a: reach[a])
-            if reach[usual] < _UPRIGHT * longest <= reach[best]:
+            if reach[usual] < _UPRIGHT * body <= reach[best]:
                 return best, "the person stands along it"
     return usual, "usual"
 
