@@ -319,6 +319,16 @@ def test_a_hierarchy_of_any_depth_is_no_trouble(tmp_path):
     assert points.position[1, -1].tolist() == [0, 0, deep]
 
 
+@pytest.mark.parametrize("suffix", ["trc", "bvh"])
+def test_a_table_cut_short_says_after_which_row(tmp_path, suffix):
+    lines = good(suffix)[0].splitlines(keepends=True)
+    (tmp_path / f"a.{suffix}").write_bytes(b"".join(lines[:-7]))
+    rows = len(short().t)
+    said = f"line {len(lines) - 6} expected {rows} rows.* ends after {rows - 7}$"
+    with pytest.raises(InputError, match=said):
+        read_points(tmp_path / f"a.{suffix}")
+
+
 def test_a_c3d_cut_short_says_after_which_sample(tmp_path):
     raw = good("c3d")[0]
     (tmp_path / "a.c3d").write_bytes(raw[: len(raw) // 2])

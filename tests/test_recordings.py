@@ -375,6 +375,27 @@ def test_markers_on_both_sides_of_a_joint_are_averaged():
         np.testing.assert_allclose(points[joint], middle)
 
 
+def test_parts_go_before_the_joints_of_a_marker_set():
+    found = recognise(GAIT, parts={"LKnee": "LTIB", "RHand": ["RFIN", "RWRA"]})
+    assert found.on_skin
+    assert "`parts`" in found.name
+    from clamber.demo.marker_sets import solve_centres
+
+    track = {i: np.full((2, 3), float(i)) + np.eye(3)[:2] * i for i in found.used()}
+    points = solve_centres(found, track)
+    np.testing.assert_array_equal(points["LKnee"], track[GAIT.index("LTIB")])
+    np.testing.assert_array_equal(points["RHand"], track[GAIT.index("RFIN")])
+    np.testing.assert_array_equal(points["RHand.1"], track[GAIT.index("RWRA")])
+
+
+def test_a_thin_box_is_never_turned_inside_out():
+    demo, _ = climb()
+    from clamber.demo.levels import _raised
+
+    box = replace(demo.scene.boxes[0], size=np.array([1.0, 1.0, 0.02]))
+    assert _raised(box, -0.05).size[2] == pytest.approx(1e-3)
+
+
 def test_hips_are_where_the_regression_puts_them():
     """Harrington's numbers, for a pelvis 250 mm wide and 150 mm deep at the origin."""
     from clamber.demo.marker_sets import _hips
@@ -599,6 +620,20 @@ def test_who_never_stands_up_does_not_turn_the_world(tmp_path):
     np.savez(tmp_path / "a.npz", positions=y_up, names=demo.names, rate=demo.rate)
     path = described(tmp_path, file="a.npz", up="y")
     np.testing.assert_allclose(load_demo(path).position, back.position, atol=1e-12)
+
+
+def test_a_person_who_stands_is_believed_before_the_file(tmp_path):
+    """C3D files that say y though z is up, or -Z as some programs do."""
+    demo, _ = climb(rate=60.0, gaps=0)
+    path = tmp_path / "take.c3d"
+    write_c3d(demo, path)
+    raw = path.read_bytes()
+    for word, said in ((b"+Y", "the person stands along it, not along y"),
+                       (b"-Z", "up: z (the file)")):  # fmt: skip
+        path.write_bytes(raw.replace(b"+Z", word))
+        back = load_demo(path)
+        assert said in back.notes[1]
+        np.testing.assert_allclose(back.point("Neck"), demo.point("Neck"), atol=1e-6)
 
 
 @pytest.mark.parametrize("up", AXES)

@@ -17,7 +17,7 @@ from typing import BinaryIO
 import numpy as np
 
 from clamber.demo.points import MAX_POINTS, Points, unique_names
-from clamber.demo.table import read_blocks
+from clamber.demo.table import check_count, read_blocks
 from clamber.errors import InputError
 
 MAGIC = b"HIERARCHY"
@@ -46,7 +46,7 @@ def read_bvh(path: Path) -> Points:
     """
     with path.open("rb") as file:
         joints, columns, line = _read_hierarchy(file, path)
-        rate, line = _read_motion(file, path, line)
+        count, rate, line = _read_motion(file, path, line)
         blocks = [
             _positions(joints, rows[k : k + _FRAMES])
             for rows in read_blocks(
@@ -56,9 +56,11 @@ def read_bvh(path: Path) -> Points:
         ]
     if not blocks:
         raise InputError("rows of numbers", source=path, field=f"line {line}")
+    position = np.concatenate(blocks)
+    check_count(len(position), count, line=line, what="Frames", source=path)
     return Points(
         names=unique_names([j.name for j in joints]),
-        position=np.concatenate(blocks),
+        position=position,
         rate=rate,
         usual_up="y",
     )
@@ -147,9 +149,9 @@ def _numbers(words: list[str], line: int, path: Path) -> np.ndarray:
     return x
 
 
-def _read_motion(file: BinaryIO, path: Path, line: int) -> tuple[float, int]:
-    """The rate, and the number of the first row's line; `Frames` is not relied on."""
-    step = np.nan
+def _read_motion(file: BinaryIO, path: Path, line: int) -> tuple[float, float, int]:
+    """How many rows there are to be, the rate, and the line of the first one."""
+    said: list[float] = []
     for key in ("Frames:", "Frame Time:"):
         text = b"\n"
         while text and not text.strip():
@@ -160,12 +162,13 @@ def _read_motion(file: BinaryIO, path: Path, line: int) -> tuple[float, int]:
                 f"`{key}` and a number", source=path, field=f"line {line}",
                 value=plain[:40],
             )  # fmt: skip
-        step = float(_numbers([plain[len(key) :]], line, path)[0])
+        said.append(float(_numbers([plain[len(key) :]], line, path)[0]))
+    count, step = said
     if not step > 0.0:
         raise InputError(
             "a positive frame time", source=path, field=f"line {line}", value=step
         )
-    return 1.0 / step, line + 1
+    return count, 1.0 / step, line + 1
 
 
 def _positions(joints: list[_Joint], rows: np.ndarray) -> np.ndarray:

@@ -283,11 +283,13 @@ def _labels(parameters: _Parameters, count: int, path: Path) -> list[str]:
 
 
 def _up(parameters: _Parameters) -> str | None:
-    """The axis that the screen shows upward."""
+    """The axis that the screen shows upward.
+
+    Its sign is not heeded: programs write -Z for a laboratory whose z is up.
+    """
     words = _words(parameters, "Y_SCREEN")
-    axis = words[0].strip().lower() if words else ""
-    plain = axis.removeprefix("+")
-    return plain if plain in ("x", "y", "z", "-x", "-y", "-z") else None
+    axis = words[0].strip().lower().lstrip("+-") if words else ""
+    return axis if axis in ("x", "y", "z") else None
 
 
 def write_c3d(demo: Demonstration, path: str | Path) -> None:
@@ -315,7 +317,7 @@ def write_c3d(demo: Demonstration, path: str | Path) -> None:
     start = 2 + blocks
     last = min(n, 65535)
     header = struct.pack(
-        "<BBHHHHHfHHf", 2, KEY, f, 0, 1, last, 0, -1.0, start, 0, demo.rate
+        "<BBHHHHHfHHf", 2, KEY, f, 0, 1, last, 0, -1.0, start, 1, demo.rate
     )
     body = samples.tobytes()
     padding = b"\0" * (-len(body) % _BLOCK)

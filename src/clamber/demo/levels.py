@@ -20,6 +20,7 @@ from clamber.scene import Box, Scene, Support
 _EVIDENCE = ("Foot", "Knee", "Hand")
 _SEARCH = 0.10  # [m] no take is further off; more is another surface
 _SPEED = 0.10  # [m/s] slower is at rest
+_THIN = 1e-3  # [m] a box is never lowered to less
 _REST = 0.3  # [s] at least
 _SMOOTH = 0.2  # [s] length of the filter for speeds
 _UP = np.array([0.0, 0.0, 1.0])
@@ -102,6 +103,7 @@ def _raised(box: Box, lift: float) -> Box:
     """The box with its top higher; its foot stays, unless it is tilted."""
     if abs(box.rotation[2, 2]) < 1 - 1e-9:
         return replace(box, position=box.position + lift * _UP)
+    lift = max(lift, _THIN - box.size[2])
     size = box.size + lift * _UP
     return replace(box, size=size, position=box.position + lift / 2 * _UP)
 
@@ -109,7 +111,7 @@ def _raised(box: Box, lift: float) -> Box:
 def _resting(demo: Demonstration, part: str, support: Support) -> np.ndarray:
     """(N,) clearances [m] of a part, sample by sample, at rest."""
     point = _telling(demo, part)
-    if point is None:
+    if point is None or point[1:] not in demo.offsets:
         return np.empty(0)
     p, seen = demo.point(point), demo.valid[:, demo.names.index(point)]
     clearance = support.height(p) - demo.offsets[point[1:]]

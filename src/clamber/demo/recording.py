@@ -323,14 +323,12 @@ def _up(
 ) -> tuple[str, str]:
     """The axis that points up, and who says so.
 
-    Where nobody says, it is the usual one of the format, unless the person stands
-    straight along another one at some time and never along this: it is then that.
+    It is what the file says, or else the usual one of the format, unless the person
+    stands straight along another one at some time and never along this: then it is that.
     """
     if said.up is not None:
         return said.up, "recording.yaml"
-    if points.up is not None:
-        return points.up, "the file"
-    usual = points.usual_up
+    usual = points.usual_up if points.up is None else points.up
     chain = [_near(found, raw, j) for j in ("Foot", "Knee", "Hip", "Shoulder")]
     both = [s for s in SIDES if all(s in joint for joint in chain)]
     if both:
@@ -346,8 +344,8 @@ def _up(
             }
             best = max(reach, key=lambda a: reach[a])
             if reach[usual] < _UPRIGHT * body <= reach[best]:
-                return best, "the person stands along it"
-    return usual, "usual"
+                return best, f"the person stands along it, not along {usual}"
+    return usual, "usual" if points.up is None else "the file"
 
 
 def _fixed(points: Points, what: FixedPoint, unit: float, path: Path) -> np.ndarray:

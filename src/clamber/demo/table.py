@@ -144,3 +144,17 @@ def place_rows(
     out = np.full((int(place[-1]) + 1, *rows.shape[1:]), np.nan)
     out[place] = rows
     return out
+
+
+def check_count(found: int, said: float, *, line: int, what: str, source: Path) -> None:
+    """Refuse a file that ends before its heading says so.
+
+    Raises:
+        InputError: There are fewer rows than `said`, from `line` on.
+    """
+    if not found >= said:
+        raise InputError(
+            f"{said:g} rows, as {what} says; the file ends after {found}",
+            source=source,
+            field=f"line {line + found}",
+        )

@@ -8,7 +8,7 @@ import numpy as np
 
 from clamber.demo.demonstration import Demonstration
 from clamber.demo.points import MAX_POINTS, Points, unique_names, unit_of
-from clamber.demo.table import place_rows, read_blocks
+from clamber.demo.table import check_count, place_rows, read_blocks
 from clamber.errors import InputError
 
 MAGIC = b"PathFileType"
@@ -66,6 +66,9 @@ def read_trc(path: Path) -> Points:
     if not blocks:
         raise InputError("rows of numbers", source=path, field=f"line {first}")
     number = np.concatenate(numbers)
+    if "numframes" in said:
+        expected = _number(said, "NumFrames", path)
+        check_count(len(number), expected, line=first, what="NumFrames", source=path)
     return Points(
         names=unique_names(names),
         position=place_rows(
