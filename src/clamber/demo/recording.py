@@ -323,8 +323,8 @@ def _up(
 ) -> tuple[str, str]:
     """The axis that points up, and who says so.
 
-    It is what the file says, or else the usual one of the format, unless the person
-    stands straight along another one at some time and never along this: then it is that.
+    It is what the file says, or else what is usual for the format, unless the person
+    stands straight along another axis at some time and never along this one.
     """
     if said.up is not None:
         return said.up, "recording.yaml"

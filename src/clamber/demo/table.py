@@ -7,6 +7,7 @@ cell by cell, which finds the line and the cell to blame.
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -37,7 +38,8 @@ def read_blocks(
     Raises:
         InputError: A row has other than `columns` cells or a cell is no finite number.
     """
-    while block := file.read(_BLOCK):
+    most = min(_BLOCK, os.fstat(file.fileno()).st_size)
+    while block := file.read(most):
         block = block + file.readline()
         rows = _parse_block(block, columns, delimiter)
         if rows is None:
