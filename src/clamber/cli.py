@@ -219,20 +219,11 @@ class ExecutionFlags:
 
 def _scene(height: float | None, path: Path | None) -> clamber.Scene:
     """The scene of a file, or the one box of `--height`."""
-    import pydantic
+    from clamber.job import scene_of
 
-    from clamber.scene import input_error
-
-    if path is not None:
-        if height is not None:
-            raise InputError("--height or --scene, not both")
-        return clamber.load_scene(path)
-    height = DEFAULT_HEIGHT if height is None else height
-    try:
-        return clamber.Scene.from_height(height)
-    except pydantic.ValidationError as e:
-        expected = input_error(e, None).expected
-        raise InputError(expected, source="--height", value=height) from e
+    if path is not None and height is not None:
+        raise InputError("--height or --scene, not both")
+    return scene_of(DEFAULT_HEIGHT if height is None else height, path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -454,6 +445,85 @@ class RobotCommand:
         return REACHED
 
 
+@dataclass(frozen=True, kw_only=True)
+class SweepCommand:
+    """Many climbs, by a spec: one row a run, success against each factor."""
+
+    spec: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SPEC")]
+    """A spec.yaml: what all runs share, and a grid, a random sample or a search."""
+    workers: Annotated[
+        int | None,
+        tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)"),
+    ] = None
+    """Processes that do the runs."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """A dask scheduler, whose workers do the runs instead."""
+    out: Place = None
+    """The sweep's folder (runs/<name of the spec>); it is gone on with if it exists."""
+    output: Printed
+
+    def run(self) -> int:
+        """Spec to table and curves."""
+        from clamber import curves, experiment, sweep
+
+        if self.workers is not None and self.workers < 1:
+            raise InputError("1 or more", source="--workers", value=self.workers)
+        if self.workers is not None and self.scheduler is not None:
+            raise InputError("--workers or --scheduler, not both")
+        spec = experiment.load_spec(self.spec)
+        folder = self.out or Path("runs") / self.spec.stem
+        sweep.check_inputs(spec)
+        try:
+            with self.output.progress() as report:
+                rows, pace = sweep.run_sweep(
+                    spec,
+                    folder,
+                    workers=self.workers,
+                    scheduler=self.scheduler,
+                    progress=report,
+                )
+                report("draw", 0.0, "")
+                curves.save_curves(spec, rows, folder)
+                report("draw", 1.0, "")
+        except KeyboardInterrupt:
+            sys.stderr.write(
+                f"clamber: interrupted; the finished rows are in {folder}, and the same"
+                " command goes on from there\n"
+            )
+            return INTERRUPTED
+        summaries = curves.summarise(spec, rows)
+        table = _table(
+            "controller", "to", "runs", "reached", "95 % interval", "half at",
+            "95 % interval",
+        )  # fmt: skip
+        for s in summaries:
+            table.add_row(
+                s.controller,
+                "" if s.end is None else f"{s.factor} {s.end:g}",
+                str(s.runs),
+                f"{s.reached} ({100 * s.share:.1f} %)",
+                f"{100 * s.low:.1f} to {100 * s.high:.1f} %",
+                s.half if isinstance(s.half, str) else f"{s.half:.4g}",
+                " to ".join(
+                    "-" if x is None else f"{x:.4g}" for x in (s.half_from, s.half_to)
+                )
+                if s.factor
+                else "",
+            )
+        note = f"{len(rows)} rows, {pace.runs} of them new; the files are in {folder}"
+        errors = sum(s.errors for s in summaries)
+        if errors:
+            note = f"{errors} runs crashed and count as not reached; {note}"
+        record = {
+            "out": str(folder),
+            "rows": len(rows),
+            "new": pace.runs,
+            "summary": [asdict(s) for s in summaries],
+        }
+        self.output.show(record, table, note=note)
+        return REACHED
+
+
 Command = (
     Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
@@ -462,6 +532,7 @@ Command = (
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
+    | Annotated[SweepCommand, tyro.conf.subcommand("sweep")]
 )
 
 

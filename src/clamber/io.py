@@ -264,6 +264,7 @@ class _BoxFile(pydantic.BaseModel):
     position: Vector
     rpy: Vector
     friction: float
+    roughness: float = 0.0
 
 
 class _GroundFile(pydantic.BaseModel):
@@ -284,6 +285,7 @@ class _SceneFile(pydantic.BaseModel):
                 position=np.array(b.position) + np.array([0.0, 0.0, b.size[2] / 2]),
                 rotation=matrix_from_rpy(b.rpy),
                 friction=b.friction,
+                roughness=b.roughness,
             )
             for b in self.boxes
         ]
@@ -306,6 +308,7 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
                 "position": b.position - [0.0, 0.0, b.size[2] / 2],
                 "rpy": _rpy(b.rotation),
                 "friction": b.friction,
+                "roughness": b.roughness,
             }
             for b in scene.boxes
         ],
