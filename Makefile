@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-all fast lint type bench pictures docs build clean
+.PHONY: help demo test test-all fast lint type bench pictures experiments docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -48,6 +48,11 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	$(BIN)/clamber climb --out build/climb
 	cp build/climb/climb.png docs/climb.png
 	$(BIN)/python -c 'from clamber.viz import cost_shapes; cost_shapes("docs/cost-shapes.png")'
+
+experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)
+	for f in examples/experiments/*.yaml; do \
+		$(BIN)/clamber sweep "$$f" --out "runs/$$(basename "$$f" .yaml)" || exit; done
+	$(BIN)/python examples/experiments/page.py runs docs
 
 docs: $(VENV)/.has-docs ## the documentation as a web site, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

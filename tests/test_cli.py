@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import subprocess
@@ -18,7 +19,9 @@ from rich.console import Console
 import clamber
 from clamber import cli
 
-COMMANDS = ("climb", "contacts", "plan", "simulate", "render", "scene", "robot")
+COMMANDS = (
+    *("climb", "contacts", "plan", "simulate", "render", "scene", "robot", "sweep"),
+)
 
 
 def run(*args: object) -> subprocess.CompletedProcess[str]:
@@ -84,6 +87,9 @@ def test_version_is_that_of_the_package(
         (["climb", "--scene", "a.yaml", "--height", "1"], "not both"),
         (["scene", "no.yaml"], "no.yaml expected a readable file"),
         (["robot", "check", "nobody.urdf"], "expected a robot.yaml"),
+        (["sweep", "no.yaml"], "no.yaml expected a readable file"),
+        (["sweep", "a.yaml", "--workers", "1", "--scheduler", "tcp://b:1"], "not both"),
+        (["sweep", "no.yaml", "--workers", "0"], "--workers is 0; expected 1 or more"),
     ],
 )
 def test_a_mistake_is_one_sentence_on_stderr_and_exit_2(
@@ -219,6 +225,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         complete=True,
         trajectory="timed",
     )
+    event = clamber.Event(time=7.25, text="LHand touches 30 mm below")
     criterion = SimpleNamespace(value=0.0123, limit=0.05, ok=True)
     verdict = SimpleNamespace(reached=True, criteria={"speed [m/s]": criterion})
     s = SimpleNamespace(
@@ -242,13 +249,13 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         monkeypatch.setitem(vars(clamber), name, stage)
 
     for name, result in {
-        "load_demo": "demo",
+        "load_demo": SimpleNamespace(notes=("recognised: SMPL", "up: y")),
         "detect_contacts": sequence,
         "new_run_folder": tmp_path / "run",
         "load_sequence": sequence,
         "load_plan": plan,
         "plan": plan,
-        "simulate": "rollout",
+        "simulate": SimpleNamespace(events=(event,), stopped=""),
         "judge": verdict,
         "render_run": [tmp_path / "run" / "video.mp4"],
     }.items():
@@ -399,8 +406,26 @@ def test_contacts_lists_the_stances_it_found(
     stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ):
     assert cli.main(["contacts", "mine.yaml"]) == 0
-    row = capsys.readouterr().out.splitlines()[1].split()
-    assert row == ["0", "O", "0.00", "1.50", "LHand", "on", "table"]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["0", "O", "0.00", "1.50", "LHand", "on", "table"]
+    assert lines[2:4] == ["recognised: SMPL", "up: y"]
+
+
+def test_contacts_says_by_how_much_the_floor_was_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    from dataclasses import replace
+
+    import numpy as np
+
+    demo = clamber.load_demo("climb")
+    lifted = replace(demo, position=demo.position + np.array([0.0, 0.0, 0.035]))
+    clamber.write_c3d(lifted, tmp_path / "take.c3d")
+    out = ["--out", str(tmp_path / "out"), "--json"]
+    assert cli.main(["contacts", str(tmp_path / "take.c3d"), "--fit-floor", *out]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert "clamber's own points" in notes[0]
+    assert any(n.startswith("fitted: ground +35 mm (foot at rest") for n in notes)
 
 
 def test_render_names_its_files(
@@ -440,7 +465,7 @@ def spoiled_robot(folder: Path) -> Path:
         ("no.npy", None, "no.npy"),
         ("film.mp4", "", "film.mp4"),
         ("joints.npy", "no array", "joints.npy"),
-        ("recording.yaml", RECORDING.format(unit="inch"), "unit is 'inch'"),
+        ("recording.yaml", RECORDING.format(unit="ell"), "unit"),
         ("recording.yaml", "- a\n- b\n", "recording.yaml"),
         ("recording.yaml", RECORDING.format(unit="m"), "joints.npy"),
     ],
@@ -564,7 +589,8 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
     assert record["complete"] is True
     assert [k["move"] for k in record["keyframes"]] == ["start", "air -> LHand on box"]
     assert record["keyframes"][1]["seconds"] > 0
-    assert cli.main(["simulate", str(run_folder), "--json"]) == 1
+    command = ["simulate", str(run_folder), "--controller", "pid", "--json"]
+    assert cli.main(command) == 1
     record = json.loads(capsys.readouterr().out)
     assert record["reached"] is False
     on_top = record["criteria"]["share of the weight at the end on obstacles"]
@@ -578,8 +604,79 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
         "scene.xml",
         "timings.json",
         "rollout.npz",
+        "execution.json",
         "verdict.json",
     }
     seconds = json.loads((run_folder / "timings.json").read_text())["seconds"]
     assert seconds["simulate"] > 0
     assert seconds["keyframes"] > 0
+
+
+@pytest.fixture
+def quick_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The words of a sweep whose jobs are quick."""
+    import sweep_jobs
+    from clamber import sweep
+
+    quick = functools.partial(sweep.run_sweep, job=sweep_jobs.breaks_at_friction)
+    monkeypatch.setattr(sweep, "run_sweep", quick)
+    spec = tmp_path / "friction.yaml"
+    spec.write_text(
+        "base: {height: 0.275}\n"
+        "search: {factor: disturb.friction, from: 1.0, to: 0.05, runs: 24}\n"
+    )
+    return ["sweep", str(spec), "--workers", "1"]
+
+
+def test_a_sweep_ends_with_a_table_of_where_each_controller_breaks(
+    quick_sweep: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(quick_sweep) == 0
+    out, err = capsys.readouterr()
+    assert "half at" in out
+    assert "48 rows, 48 of them new; the files are in runs/friction" in out
+    assert "sweep 100 % 48 of 48" in err
+    names = {f.name for f in (tmp_path / "runs" / "friction").iterdir()}
+    wanted = {"spec.yaml", "runs.csv", "timings.json", "success.png"}
+    assert {*wanted, "summary.csv", "curve.csv"} <= names
+    assert cli.main([*quick_sweep, "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["rows"], record["new"]) == (48, 0)
+    pid, mixed = record["summary"]
+    assert pid["half"] == pytest.approx(0.4, abs=0.05)
+    assert mixed["half"] == pytest.approx(0.3, abs=0.05)
+    sessions = json.loads(Path("runs/friction/timings.json").read_text())["sessions"]
+    assert [s["runs"] for s in sessions] == [48]
+
+
+def test_a_sweep_that_is_interrupted_says_how_to_go_on(
+    quick_sweep: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    from clamber import sweep
+
+    def interrupt(*args: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "run_sweep", interrupt)
+    assert cli.main([*quick_sweep, "--out", str(tmp_path / "out")]) == 130
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("clamber: interrupted; the finished rows are in ")
+    assert said.endswith("the same command goes on from there")
+
+
+def test_a_sweep_with_a_robot_that_is_not_there_runs_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    spec = tmp_path / "spec.yaml"
+    spec.write_text("base: {robot: nobody}\ngrid: {height: [0.2, 0.3]}\n")
+    out = tmp_path / "out"
+    assert cli.main(["sweep", str(spec), "--out", str(out)]) == 2
+    assert "nobody" in capsys.readouterr().err
+    assert not out.exists()

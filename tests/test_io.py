@@ -15,6 +15,7 @@ import pytest
 import clamber
 from clamber import io
 from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.disturbance import Disturbance
 from clamber.errors import InputError, Status
 from clamber.model import ROBOTS, World
 from clamber.pipeline import Plan, Skipped
@@ -72,7 +73,7 @@ def saved(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def rollout(plan: Plan) -> Rollout:
-    return clamber.simulate(plan)
+    return clamber.simulate(plan, controller="pid")
 
 
 def same(a: object, b: object) -> bool:
@@ -305,7 +306,7 @@ def test_the_world_of_a_loaded_plan_is_the_one_that_planned(plan: Plan, saved: P
 
 
 def test_a_loaded_plan_simulates_to_the_same_bits(saved: Path, rollout: Rollout):
-    again = clamber.simulate(io.load_plan(saved))
+    again = clamber.simulate(io.load_plan(saved), controller="pid")
     assert same(again, rollout)
 
 
@@ -526,7 +527,10 @@ def test_meshes_travel_with_the_scene(plan: Plan, tmp_path: Path):
 # Rollouts and verdicts.
 
 
-def test_a_rollout_survives_the_disk_to_the_last_bit(rollout: Rollout, tmp_path: Path):
+def test_a_rollout_survives_the_disk_to_the_last_bit(
+    plan: Plan, rollout: Rollout, tmp_path: Path
+):
+    io.save_plan(plan, tmp_path)
     io.save_rollout(plan, rollout, tmp_path)
     back = io.load_rollout(tmp_path)
     assert same(back, rollout)
@@ -534,8 +538,32 @@ def test_a_rollout_survives_the_disk_to_the_last_bit(rollout: Rollout, tmp_path:
         assert isinstance(getattr(rollout, f.name), type(getattr(back, f.name))), f.name
 
 
+def test_what_ran_and_what_was_planned_are_both_kept(plan: Plan, tmp_path: Path):
+    """A lower box and a push, felt: other physics, another reference, the same plan."""
+    truth = Disturbance(height=-0.02, push=20.0, seed=3)
+    felt = clamber.simulate(plan, controller="mixed", disturbance=truth)
+    assert felt.followed is not None
+    assert felt.events
+    io.save_plan(plan, tmp_path)
+    planned = {n: (tmp_path / n).read_bytes() for n in (io.SCENE, io.TRAJECTORY)}
+    io.save_rollout(plan, felt, tmp_path)
+    assert (tmp_path / io.PLANNED_SCENE).read_bytes() == planned[io.SCENE]
+    assert (tmp_path / io.PLANNED_TRAJECTORY).read_bytes() == planned[io.TRAJECTORY]
+    back = io.load_rollout(tmp_path)
+    assert same(back, felt)
+    assert back.world.scene.boxes[0].size[2] == pytest.approx(HEIGHT - 0.02)
+    again = io.load_plan(tmp_path)
+    assert same(again.trajectory, plan.trajectory)
+    assert again.world.xml == plan.world.xml
+    # The next run, open loop in the planned world, leaves none of that behind.
+    io.save_rollout(plan, clamber.simulate(plan, controller="pid"), tmp_path)
+    assert {n: (tmp_path / n).read_bytes() for n in planned} == planned
+    assert not (tmp_path / io.PLANNED_SCENE).exists()
+    assert not (tmp_path / io.PLANNED_TRAJECTORY).exists()
+
+
 def test_plain_mujoco_replays_the_rollout(
-    saved: Path, rollout: Rollout, tmp_path: Path
+    plan: Plan, saved: Path, rollout: Rollout, tmp_path: Path
 ):
     io.save_rollout(plan, rollout, tmp_path)
     model = mujoco.MjModel.from_xml_path(str(saved / "scene.xml"))
@@ -551,10 +579,10 @@ def test_plain_mujoco_replays_the_rollout(
             mujoco.mj_step(model, data)
 
 
-def test_a_broken_rollout_is_named(rollout: Rollout, tmp_path: Path):
+def test_a_broken_rollout_is_named(plan: Plan, rollout: Rollout, tmp_path: Path):
     with pytest.raises(InputError, match=r"rollout\.npz expected a whole"):
         io.load_rollout(tmp_path)
-    io.save_rollout(replace(rollout, qpos=rollout.qpos[1:]), tmp_path)
+    io.save_rollout(plan, replace(rollout, qpos=rollout.qpos[1:]), tmp_path)
     with pytest.raises(InputError, match="shape of qpos"):
         io.load_rollout(tmp_path)
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from clamber.disturbance import Disturbance
 from clamber.model import PHYSICS_STEP, build_world
 from clamber.scene import Scene
 from clamber.simulation import (
@@ -90,7 +91,8 @@ def test_two_runs_are_the_same_to_the_last_bit(start_only):
 
 
 def test_the_beginning_does_not_depend_on_the_end(start_only, demo_rollout):
-    short = simulate(start_only)
+    exact = Disturbance(noise=0.0, delay=0.0)
+    short = simulate(start_only, controller="pid", disturbance=exact)
     assert np.array_equal(short.qpos, demo_rollout.qpos[: len(short.qpos)])
 
 
@@ -179,8 +181,9 @@ def test_a_part_that_is_no_surface_is_counted_as_unintended(demo_plan, start_onl
     q[:, :3] = [-1.0, 0.0, 0.30]
     sitting = turned(q[0], 1, -1.2)
     q[:, 3:7] = sitting[3:7]
-    dropped = replace(start_only, trajectory=replace(t, q=q))
-    rollout = simulate(dropped)
+    world = replace(start_only.world, home=q[0])
+    dropped = replace(start_only, world=world, trajectory=replace(t, q=q))
+    rollout = simulate(dropped, controller="pid")
     assert rollout.unintended.max() > 100.0
     assert rollout.unintended_share > 0.3
     assert sum(rollout.unintended_parts.values()) == pytest.approx(

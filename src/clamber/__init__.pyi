@@ -2,8 +2,11 @@ from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
 from clamber.contact import Stance as Stance
+from clamber.curves import save_curves as save_curves
 from clamber.demo import Demonstration as Demonstration
 from clamber.demo import load_demo as load_demo
+from clamber.demo import write_c3d as write_c3d
+from clamber.demo import write_trc as write_trc
 from clamber.detect import detect_contacts as detect_contacts
 from clamber.disturbance import Disturbance as Disturbance
 from clamber.errors import ClamberError as ClamberError
@@ -12,6 +15,8 @@ from clamber.errors import InputError as InputError
 from clamber.errors import MissingDependency as MissingDependency
 from clamber.errors import Status as Status
 from clamber.execution import Event as Event
+from clamber.experiment import Spec as Spec
+from clamber.experiment import load_spec as load_spec
 from clamber.io import load_plan as load_plan
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
@@ -19,6 +24,9 @@ from clamber.io import save_plan as save_plan
 from clamber.io import save_rollout as save_rollout
 from clamber.io import save_sequence as save_sequence
 from clamber.io import save_verdict as save_verdict
+from clamber.job import Job as Job
+from clamber.job import Outcome as Outcome
+from clamber.job import run_job as run_job
 from clamber.model import Kinematics as Kinematics
 from clamber.model import Robot as Robot
 from clamber.model import World as World
@@ -37,6 +45,8 @@ from clamber.simulation import Rollout as Rollout
 from clamber.simulation import Verdict as Verdict
 from clamber.simulation import judge as judge
 from clamber.simulation import simulate as simulate
+from clamber.sweep import load_sweep as load_sweep
+from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
 from clamber.viz import render_run as render_run
 

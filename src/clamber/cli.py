@@ -219,20 +219,11 @@ class ExecutionFlags:
 
 def _scene(height: float | None, path: Path | None) -> clamber.Scene:
     """The scene of a file, or the one box of `--height`."""
-    import pydantic
+    from clamber.job import scene_of
 
-    from clamber.scene import input_error
-
-    if path is not None:
-        if height is not None:
-            raise InputError("--height or --scene, not both")
-        return clamber.load_scene(path)
-    height = DEFAULT_HEIGHT if height is None else height
-    try:
-        return clamber.Scene.from_height(height)
-    except pydantic.ValidationError as e:
-        expected = input_error(e, None).expected
-        raise InputError(expected, source="--height", value=height) from e
+    if path is not None and height is not None:
+        raise InputError("--height or --scene, not both")
+    return scene_of(DEFAULT_HEIGHT if height is None else height, path)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,6 +232,8 @@ class ClimbCommand:
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
     """A recording, or the built-in demonstration (climb)."""
+    fit_floor: bool = False
+    """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
@@ -257,9 +250,9 @@ class ClimbCommand:
         with self.output.progress() as show:
             report = clock.watching(show)
             report("detect", 0.0, "")
-            demo = clamber.load_demo(self.demo)
+            demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
             sequence = clamber.detect_contacts(demo)
-            report("detect", 1.0, "")
+            report("detect", 1.0, "; ".join(demo.notes[:1]))
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():
@@ -289,6 +282,8 @@ class ContactsCommand:
     """A recording, recording.yaml, or a built-in demonstration by name."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The scene.yaml it was recorded in, where the recording has none."""
+    fit_floor: bool = False
+    """Correct the heights of floor and boxes by what rests on them."""
     out: Place = None
     """The run folder (runs/contacts, then runs/contacts-2 ...)."""
     output: Printed
@@ -298,9 +293,10 @@ class ContactsCommand:
         scene = None if self.scene is None else clamber.load_scene(self.scene)
         with self.output.progress() as report:
             report("detect", 0.0, "")
-            sequence = clamber.detect_contacts(
-                clamber.load_demo(self.recording, scene=scene)
+            demo = clamber.load_demo(
+                self.recording, scene=scene, fit_floor=self.fit_floor
             )
+            sequence = clamber.detect_contacts(demo)
             folder = clamber.new_run_folder(self.out, "contacts")
             clamber.save_sequence(sequence, folder / "sequence.json")
         table = _table("stance", "region", "from [s]", "to [s]", "contacts")
@@ -308,8 +304,13 @@ class ContactsCommand:
             on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
             t0, t1 = sequence.t[i], sequence.t[i + 1]
             table.add_row(str(i), stance.region, f"{t0:.2f}", f"{t1:.2f}", on)
-        record = {"out": str(folder), "stances": len(sequence.stances)}
-        self.output.show(record, table, note=f"the sequence is in {folder}")
+        record = {
+            "out": str(folder),
+            "stances": len(sequence.stances),
+            "notes": list(demo.notes),
+        }
+        note = "\n".join([*demo.notes, f"the sequence is in {folder}"])
+        self.output.show(record, table, note=note)
         return REACHED
 
 
@@ -444,6 +445,85 @@ class RobotCommand:
         return REACHED
 
 
+@dataclass(frozen=True, kw_only=True)
+class SweepCommand:
+    """Many climbs, by a spec: one row a run, success against each factor."""
+
+    spec: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SPEC")]
+    """A spec.yaml: what all runs share, and a grid, a random sample or a search."""
+    workers: Annotated[
+        int | None,
+        tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)"),
+    ] = None
+    """Processes that do the runs."""
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """A dask scheduler, whose workers do the runs instead."""
+    out: Place = None
+    """The sweep's folder (runs/<name of the spec>); it is gone on with if it exists."""
+    output: Printed
+
+    def run(self) -> int:
+        """Spec to table and curves."""
+        from clamber import curves, experiment, sweep
+
+        if self.workers is not None and self.workers < 1:
+            raise InputError("1 or more", source="--workers", value=self.workers)
+        if self.workers is not None and self.scheduler is not None:
+            raise InputError("--workers or --scheduler, not both")
+        spec = experiment.load_spec(self.spec)
+        folder = self.out or Path("runs") / self.spec.stem
+        sweep.check_inputs(spec)
+        try:
+            with self.output.progress() as report:
+                rows, pace = sweep.run_sweep(
+                    spec,
+                    folder,
+                    workers=self.workers,
+                    scheduler=self.scheduler,
+                    progress=report,
+                )
+                report("draw", 0.0, "")
+                curves.save_curves(spec, rows, folder)
+                report("draw", 1.0, "")
+        except KeyboardInterrupt:
+            sys.stderr.write(
+                f"clamber: interrupted; the finished rows are in {folder}, and the same"
+                " command goes on from there\n"
+            )
+            return INTERRUPTED
+        summaries = curves.summarise(spec, rows)
+        table = _table(
+            "controller", "to", "runs", "reached", "95 % interval", "half at",
+            "95 % interval",
+        )  # fmt: skip
+        for s in summaries:
+            table.add_row(
+                s.controller,
+                "" if s.end is None else f"{s.factor} {s.end:g}",
+                str(s.runs),
+                f"{s.reached} ({100 * s.share:.1f} %)",
+                f"{100 * s.low:.1f} to {100 * s.high:.1f} %",
+                s.half if isinstance(s.half, str) else f"{s.half:.4g}",
+                " to ".join(
+                    "-" if x is None else f"{x:.4g}" for x in (s.half_from, s.half_to)
+                )
+                if s.factor
+                else "",
+            )
+        note = f"{len(rows)} rows, {pace.runs} of them new; the files are in {folder}"
+        errors = sum(s.errors for s in summaries)
+        if errors:
+            note = f"{errors} runs crashed and count as not reached; {note}"
+        record = {
+            "out": str(folder),
+            "rows": len(rows),
+            "new": pace.runs,
+            "summary": [asdict(s) for s in summaries],
+        }
+        self.output.show(record, table, note=note)
+        return REACHED
+
+
 Command = (
     Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
@@ -452,6 +532,7 @@ Command = (
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
+    | Annotated[SweepCommand, tyro.conf.subcommand("sweep")]
 )
 
 

@@ -32,7 +32,7 @@ class Disturbance:
     height: float = 0.0
     """Every box is higher by this."""
     unevenness: float = 0.0
-    """Tops are tiles whose heights are off by up to this, up or down, by `seed`."""
+    """Tops are warped: tiles whose heights are off by up to this, by `seed`."""
     roll: float = 0.0
     """Boxes are tilted by this about x, through the middle of their near edge."""
     pitch: float = 0.0

@@ -64,7 +64,7 @@ _OF_AN_EARLIER_PLAN = (
     PLANNED_SCENE,
     PLANNED_TRAJECTORY,
 )
-_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped"}
+_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped", "rests_on"}
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -264,6 +264,7 @@ class _BoxFile(pydantic.BaseModel):
     position: Vector
     rpy: Vector
     friction: float
+    roughness: float = 0.0
 
 
 class _GroundFile(pydantic.BaseModel):
@@ -284,6 +285,7 @@ class _SceneFile(pydantic.BaseModel):
                 position=np.array(b.position) + np.array([0.0, 0.0, b.size[2] / 2]),
                 rotation=matrix_from_rpy(b.rpy),
                 friction=b.friction,
+                roughness=b.roughness,
             )
             for b in self.boxes
         ]
@@ -306,6 +308,7 @@ def scene_fields(scene: Scene) -> dict[str, Any]:
                 "position": b.position - [0.0, 0.0, b.size[2] / 2],
                 "rpy": _rpy(b.rotation),
                 "friction": b.friction,
+                "roughness": b.roughness,
             }
             for b in scene.boxes
         ],
@@ -929,6 +932,7 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
             "events": [asdict(e) for e in rollout.events],
             "fell": rollout.fell,
             "stopped": rollout.stopped,
+            "rests_on": rollout.rests_on,
         },
     )
 
@@ -983,6 +987,7 @@ def load_rollout(folder: str | Path) -> Rollout:
         events=tuple(Event(time=e.time, text=e.text) for e in file.events),
         fell=file.fell,
         stopped=file.stopped,
+        rests_on=tuple(file.rests_on),
     )
 
 
@@ -996,6 +1001,7 @@ class _ExecutionFile(pydantic.BaseModel):
     events: list[_EventFile]
     fell: bool
     stopped: str
+    rests_on: list[str]
 
 
 class _CriterionFile(pydantic.BaseModel):

@@ -91,13 +91,18 @@ class Support:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Box:
-    """A box obstacle: full lengths, centre and rotation in the world."""
+    """A box obstacle: full lengths, centre and rotation in the world.
+
+    Its faces are uneven by about `roughness` [m]: what is no contact keeps so much more
+    distance from them.
+    """
 
     name: str
     size: np.ndarray
     position: np.ndarray
     rotation: np.ndarray
     friction: float = 0.8
+    roughness: float = 0.0
 
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""
@@ -219,6 +224,7 @@ Length = Annotated[
     float, pydantic.AfterValidator(_finite), pydantic.AfterValidator(_positive)
 ]
 Friction = Annotated[float, pydantic.Field(gt=0.0, le=1.0)]
+Roughness = Annotated[float, pydantic.Field(ge=0.0, le=0.1)]
 
 
 class _Strict(pydantic.BaseModel):
@@ -239,6 +245,7 @@ class BoxFile(_Strict):
     position: tuple[Number, Number] | tuple[Number, Number, Number]
     rpy: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     friction: Friction = 0.8
+    roughness: Roughness = 0.0
 
 
 class SceneFile(_Strict):
@@ -271,6 +278,7 @@ class SceneFile(_Strict):
                     position=np.array(centre),
                     rotation=matrix_from_rpy(b.rpy),
                     friction=b.friction,
+                    roughness=b.roughness,
                 )
             )
         return Scene(

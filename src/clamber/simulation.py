@@ -62,6 +62,7 @@ class Rollout:
         events: What was felt on the way, and what was done about it.
         fell: The run ended at once because the robot fell.
         stopped: Why the robot stopped in a stance on the way; empty where it did not.
+        rests_on: Surfaces in contact at the end, as executed, by `surface@support`.
     """
 
     world: World
@@ -86,6 +87,7 @@ class Rollout:
     events: tuple[Event, ...] = ()
     fell: bool = False
     stopped: str = ""
+    rests_on: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -217,6 +219,7 @@ def _run(
         events=tuple(pilot.events),
         fell=fell,
         stopped=pilot.stopped,
+        rests_on=pilot.rests_on,
     )
 
 
@@ -310,7 +313,7 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     followed = rollout.followed or plan.trajectory
     planned, last = followed.q[-1], rollout.qpos[-1]
     final = plan.keyframes[-1].stance
-    on_plan = sum(rollout.end_share.get(f"{c.surface}@{c.support}", 0.0) for c in final)
+    on_plan = sum(rollout.end_share.get(key, 0.0) for key in rollout.rests_on)
     on_ground = sum(v for k, v in rollout.end_share.items() if k.endswith("@" + GROUND))
     on_boxes = sum(rollout.end_share.values()) - on_ground
     up, up_planned = (_up(q[3:7]) for q in (last, planned))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from clamber.disturbance import Disturbance
 from clamber.errors import InputError
@@ -17,7 +18,8 @@ from clamber.model import PHYSICS_STEP, World, build_world, index_world
 from clamber.scene import Box, Scene
 from clamber.se3 import matrix_from_rpy
 
-TILE = 0.2  # [m] side of the tiles of an uneven top, about
+TILE = 0.1  # [m] side of the tiles of an uneven top, about
+SWELL = 0.15  # [m] standard deviation of the kernel that their heights are smoothed by
 PUSH_TIME = 0.2  # [s]
 PUSH_MARGIN = 0.5  # [s] no push begins earlier, or ends later before the end
 
@@ -97,11 +99,15 @@ def disturbed_scene(scene: Scene, d: Disturbance) -> Scene:
 def _tile(
     spec: mujoco.MjSpec, box: Box, unevenness: float, rng: np.random.Generator
 ) -> None:
-    """Sink the box to its lowest tile and put tiles on it, without gaps."""
+    """Sink the box to its lowest tile and put tiles on it, without gaps.
+
+    Heights are smoothed white noise: like warped boards, higher here and lower there.
+    """
     geom = spec.geom(box.name)
     n = np.maximum(np.round(box.size[:2] / TILE), 1).astype(int)
     side = box.size[:2] / n
-    off = rng.uniform(-unevenness, unevenness, n)
+    off = gaussian_filter(rng.normal(size=n), SWELL / side)
+    off *= unevenness / np.abs(off).max()
     depth = min(2.0 * unevenness + 0.02, 0.5 * float(box.size[2]))
     base = box.size[2] - depth
     geom.size = [*(box.size[:2] / 2), base / 2]

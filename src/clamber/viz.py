@@ -498,7 +498,7 @@ def demonstration_plot(
     }
     fig = _height_figure(t, tracks, contact, _PARTS, sequence.scene)
     fig.suptitle(f"The person: {sequence.source}", fontsize=10)
-    return _save_plot(fig, path)
+    return save_plot(fig, path)
 
 
 def contact_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
@@ -519,7 +519,7 @@ def contact_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
     panels = _limb_panels(world.robot)
     fig = _height_figure(rollout.time[rows], tracks, contact, panels, world.scene)
     fig.suptitle(f"{world.robot.name} in physics", fontsize=10)
-    return _save_plot(fig, path)
+    return save_plot(fig, path)
 
 
 _PARTS = {
@@ -566,7 +566,7 @@ def _height_figure(
                 inside = (t >= t0) & (t <= t1)
                 ax.plot(t[inside], tracks[s][inside], color=colour, lw=3.5)
         ax.set_title(limb, fontsize=9, loc="left")
-        _finish_axes(ax)
+        finish_axes(ax)
     for ax in axes[2:]:
         ax.set_xlabel("time [s]")
     for ax in axes[::2]:
@@ -574,7 +574,8 @@ def _height_figure(
     return fig
 
 
-def _finish_axes(ax: Axes) -> None:
+def finish_axes(ax: Axes) -> None:
+    """Legend, two spines, small labels."""
     ax.legend(fontsize=8, frameon=False, loc="upper right")
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=8)
@@ -599,7 +600,7 @@ def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
         ax.set_xlim(t[0], t[-1])
         ax.set_ylim(0.0, 1.3 * max(0.1, float(np.nanmax(np.append(limit, d)))))
         ax.set_ylabel("d [m]; dashed: limit", fontsize=8)
-        _finish_axes(ax)
+        finish_axes(ax)
     ax = fig.add_subplot(grid[2, :])
     ax.plot(t, margin, color="0.15", lw=1.2, label="CoM inside the support polygon")
     ax.axhline(0.0, color="#b91c1c", lw=1, ls="--", label="its border")
@@ -609,8 +610,8 @@ def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
     ax.set_xlabel("time [s]")
     ax.set_ylabel("margin [m]", fontsize=8)
     ax.set_ylim(top=1.3 * max(0.05, float(np.nanmax(np.append(margin, 0.0)))))
-    _finish_axes(ax)
-    return _save_plot(fig, path)
+    finish_axes(ax)
+    return save_plot(fig, path)
 
 
 def stability_over_time(
@@ -677,12 +678,13 @@ def cost_shapes(path: str | Path) -> Path:
     )
     ax.set_xlabel("contact against the projection of its supported mass, x [m]")
     ax.set_ylabel("cost")
-    _finish_axes(ax)
+    finish_axes(ax)
     ax.legend(fontsize=8, frameon=False, loc="upper center")
-    return _save_plot(fig, path)
+    return save_plot(fig, path)
 
 
-def _save_plot(fig: Figure, path: str | Path) -> Path:
+def save_plot(fig: Figure, path: str | Path) -> Path:
+    """Write a figure whole, without the date or version of what drew it."""
     path = Path(path)
     with whole_file(path) as draft:
         fig.savefig(draft, dpi=110, metadata={"Software": None})

@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 
 from clamber.errors import Status
-from clamber.model import Kinematics, World
+from clamber.model import Kinematics, Proximity, World
 from clamber.scene import Support
 from clamber.se3 import frame_from_normal, matrix_from_quat, rotation_vector
 from clamber.statics import (
@@ -53,6 +53,7 @@ DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
+ROUGHNESS_WEIGHT = 10.0  # soft task: more distance from what is rough
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
 SOFT = 8  # daqp's type of a constraint that may give way
 
@@ -304,6 +305,10 @@ class IK:
         self._senses: dict[int, np.ndarray] = {}
         self._violation = 0.0
         self._edges = {n: s.edges() for n, s in world.supports.items()}
+        self._rough = np.zeros(len(world.pairs))
+        for box in world.scene.boxes:
+            of_box = world.pairs == world.support_geom[box.name]
+            self._rough[of_box.any(axis=1)] = box.roughness
         self._geom_body = world.model.geom_bodyid
 
     def build(
@@ -329,8 +334,9 @@ class IK:
         if problem.lean is not None:
             self._lean_rows(*problem.lean)
         self._balance_rows(problem)
+        if self._rough.any():
+            self._roughness_rows(problem)
         self._distance_rows(problem.clearance, reach)
-
         nv = w.model.nv
         J, e = soft.J[: soft.n], soft.lo[: soft.n]
         H = J.T @ J
@@ -770,14 +776,44 @@ class IK:
         )
 
     def _distance_rows(self, clearance: np.ndarray, reach: float) -> None:
-        kin = self.kin
         counts = np.isfinite(clearance)
         if not counts.any():
             return
-        near = kin.proximity(reach, counts)
+        near = self.kin.proximity(reach, counts)
         if len(near.pairs) == 0:
             return
-        k = self._ineq.take(len(near.pairs))
+        k = self._pair_rows(self._ineq, near)
+        short = clearance[near.pairs] - near.distance
+        self._violation += _size(np.maximum(short, 0.0))
+        self._ineq.lo[k] = short
+        self._ineq.hi[k] = 1e30
+
+    def _roughness_rows(self, problem: PostureProblem) -> None:
+        """Keep farther from what is rough, as a task for each pair that is too near.
+
+        The links in contact with it are as near as their contact is.
+        """
+        w = self.world
+        counts = np.isfinite(problem.clearance) & (self._rough > 0)
+        for g in problem.goals:
+            if g.hard:
+                of_link = self._geom_body[w.pairs] == w.surfaces[g.surface].body
+                of_support = w.pairs == w.support_geom[g.support]
+                counts &= ~(of_link.any(axis=1) & of_support.any(axis=1))
+        wanted = problem.clearance + self._rough
+        near = self.kin.proximity(float(wanted.max(initial=0.0, where=counts)), counts)
+        short = np.maximum(wanted[near.pairs] - near.distance, 0.0)
+        if not short.any():
+            return
+        k = self._pair_rows(self._soft, near)
+        self._soft.J[k] *= ROUGHNESS_WEIGHT
+        self._soft.J[k][short == 0.0] = 0.0
+        self._soft.lo[k] = -ROUGHNESS_WEIGHT * short
+
+    def _pair_rows(self, rows: _Rows, near: Proximity) -> slice:
+        """Rows whose Jacobian is that of the pairs' distances."""
+        kin = self.kin
+        k = rows.take(len(near.pairs))
         pairs = self.world.pairs[near.pairs]
         for row, (a, b), n, p1, p2 in zip(
             range(k.start, k.stop),
@@ -790,15 +826,12 @@ class IK:
             if a and b:
                 kin.point_jacobian(int(b), p2, self._jac)
                 kin.point_jacobian(int(a), p1, self._jac2)
-                self._ineq.J[row] = n @ (self._jac - self._jac2)
+                rows.J[row] = n @ (self._jac - self._jac2)
             elif b:
-                self._ineq.J[row] = n @ kin.point_jacobian(int(b), p2)
+                rows.J[row] = n @ kin.point_jacobian(int(b), p2)
             else:
-                self._ineq.J[row] = -n @ kin.point_jacobian(int(a), p1)
-        short = clearance[near.pairs] - near.distance
-        self._violation += _size(np.maximum(short, 0.0))
-        self._ineq.lo[k] = short
-        self._ineq.hi[k] = 1e30
+                rows.J[row] = -n @ kin.point_jacobian(int(a), p1)
+        return k
 
 
 def _as_slice(indices: np.ndarray) -> slice | np.ndarray:

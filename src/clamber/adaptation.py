@@ -1,0 +1,242 @@
+"""A stance as it was felt -> the rest of the plan from there.
+
+Contacts are where they are, the supports as they are believed to be. From the measured
+posture the robot settles into an optimised one in the same stance, and the steps that
+are left are planned by the ordinary search. Feeling for a contact that was not where it
+was planned is a trajectory of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clamber.contact import Contact
+from clamber.errors import InputError, Status
+from clamber.model import World, build_world
+from clamber.moves import Step, split_moves
+from clamber.path import ARC_WEIGHT, Phase, bridge
+from clamber.pipeline import Plan, search_steps
+from clamber.posture import direct
+from clamber.posture.ik import IK, ContactGoal, support_rotation
+from clamber.posture.keyframe import Keyframe, KeyframeTask
+from clamber.scaling import retarget
+from clamber.scene import Scene
+from clamber.search import standing
+from clamber.trajectory import HOLD_END, HOLD_START, RATE, Trajectory, build_trajectory
+from clamber.transition import balance_problem
+
+REACH = 0.12  # [m] a contact is looked for this far from where it was planned
+FEELING_SPEED = 0.06  # [m/s] along the normal
+FEELING_NODES = 9  # postures on the way
+FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Adapted:
+    """The rest of a plan.
+
+    Attributes:
+        world: As it is believed to be.
+        trajectory: None where there is no way, or nothing left to do.
+        keyframes: The present stance first; one more for each step.
+        missed: Why steps are missing; empty where none is.
+    """
+
+    world: World
+    trajectory: Trajectory | None
+    keyframes: tuple[Keyframe, ...]
+    missed: str
+
+
+def adapt_plan(
+    plan: Plan,
+    scene: Scene,
+    made: int,
+    contacts: Sequence[Contact],
+    loaded: Sequence[Contact],
+    q: np.ndarray,
+    commanded: np.ndarray,
+) -> Adapted:
+    """Take a stance as it is and plan the steps that are left.
+
+    Args:
+        plan: The first one.
+        scene: As it is believed to be. Where there is no way at the distance that its
+            roughness asks for, that is not kept.
+        made: Steps of the plan's sequence that have been made.
+        contacts: Where they are.
+        loaded: Those of them that bear load already.
+        q: (nq,) joint angles as commanded, the base as measured.
+        commanded: (nq,) reference at present; the new one begins there.
+    """
+    found = _adapt(plan, scene, made, contacts, loaded, q, commanded)
+    if found.missed and any(b.roughness > 0 for b in scene.boxes):
+        smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
+        scene = replace(scene, boxes=smooth)
+        other = _adapt(plan, scene, made, contacts, loaded, q, commanded)
+        if not other.missed or len(other.keyframes) > len(found.keyframes):
+            return other
+    return found
+
+
+def _adapt(
+    plan: Plan,
+    scene: Scene,
+    made: int,
+    contacts: Sequence[Contact],
+    loaded: Sequence[Contact],
+    q: np.ndarray,
+    commanded: np.ndarray,
+) -> Adapted:
+    world = build_world(plan.world.robot, scene)
+    ik = IK(world)
+    stance, bearing = tuple(contacts), tuple(loaded)
+    problem = balance_problem(
+        world,
+        held=bearing,
+        closed=tuple(c for c in stance if c not in bearing),
+        q_reference=q,
+        posture_weight=1.0,
+        margin=0.005,
+    )
+    problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
+    now = ik.solve_hard(problem, q)
+    task = KeyframeTask(held=stance, new=(), q_reference=now.q)
+    key = direct.optimise(ik, task, now.q, plan.options.keyframe)
+    if key.status is not Status.SOLVED:
+        reason = f"no stable posture here: {key.status.value}"
+        return Adapted(world=world, trajectory=None, keyframes=(), missed=reason)
+    begin = now.q.copy()
+    begin[world.qadr] = commanded[world.qadr]
+    lead = (
+        Phase(
+            kind="shift",
+            q=np.array([begin, now.q]),
+            contacts=stance,
+            load_before=bearing,
+            load_after=bearing,
+        ),
+        Phase(
+            kind="settle",
+            q=bridge(ik, now.q, key.q, stance, stance),
+            contacts=stance,
+            load_before=bearing,
+            load_after=stance,
+        ),
+    )
+    return _rest(plan, ik, made, key, lead)
+
+
+def start_again(plan: Plan, scene: Scene) -> Adapted:
+    """The whole plan anew, from where the scene says that the robot stands."""
+    ik = IK(build_world(plan.world.robot, scene))
+    return _rest(plan, ik, 0, standing(ik, plan.options.keyframe), ())
+
+
+def _rest(
+    plan: Plan, ik: IK, made: int, key: Keyframe, lead: tuple[Phase, ...]
+) -> Adapted:
+    """The steps after the first `made`, from a keyframe that `lead` leads to."""
+    world = ik.world
+    try:
+        sequence = retarget(plan.sequence, world)
+    except InputError as e:
+        return Adapted(world=world, trajectory=None, keyframes=(key,), missed=str(e))
+    steps = _from_here(split_moves(sequence, world)[0][made:], key, world)
+    found, _ = search_steps(ik, steps, plan.options, start=key)
+    phases = [*lead, *(p for path in found.paths for p in path.phases)]
+    ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in found.paths])
+    trajectory = None
+    if phases:
+        trajectory = build_trajectory(
+            world, phases, speed=plan.options.speed, keyframe_after=ends.tolist()
+        )
+    return Adapted(
+        world=world,
+        trajectory=trajectory,
+        keyframes=found.keyframes,
+        missed=found.missed[0].reason if found.missed else "",
+    )
+
+
+def _from_here(steps: list[Step], key: Keyframe, world: World) -> list[Step]:
+    """The steps, where each limb leaves the surface that it is really on."""
+    on = {world.robot.limb_of(c.surface).name: c.surface for c in key.stance}
+    out = []
+    for step in steps:
+        surface = on.pop(step.move.limb, None)
+        if surface is not None and step.move.breaks:
+            step = replace(step, move=replace(step.move, breaks=(surface,)))
+        out.append(step)
+    return out
+
+
+def feeling(
+    world: World, held: tuple[Contact, ...], contact: Contact, q: np.ndarray
+) -> Trajectory | None:
+    """A reference that goes on along the normal beyond where a contact was planned.
+
+    Args:
+        world: As it is believed to be.
+        held: Contacts that bear load meanwhile.
+        contact: That was not there.
+        q: (nq,) reference to begin from.
+
+    Returns:
+        As far as can be reached, at most `REACH`; None where that is nowhere.
+    """
+    lower = tuple(
+        replace(b, position=b.position - REACH * b.top.normal)
+        if b.name == contact.support
+        else b
+        for b in world.scene.boxes
+    )
+    world = build_world(world.robot, replace(world.scene, boxes=lower))
+    ik = IK(world)
+    support = world.supports[contact.support]
+    nodes, depths = [q], [0.0]
+    for depth in np.linspace(0.0, REACH, FEELING_NODES)[1:].tolist():
+        goal = ContactGoal(
+            surface=contact.surface,
+            support=contact.support,
+            position=contact.position - depth * support.normal,
+            rotation=support_rotation(support, contact.quaternion),
+            hard=False,
+            reference=ARC_WEIGHT,
+        )
+        problem = balance_problem(
+            world,
+            held=held,
+            q_reference=nodes[-1],
+            extra=(goal,),
+            touching={contact.surface: contact.support},
+            posture_weight=0.3,
+            margin=0.01,
+        )
+        problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
+        solution = ik.solve(problem, nodes[-1], iterations=25)
+        ik.kin.update(solution.q)
+        p = ik.kin.contact_point(contact.surface, support.normal)
+        short = float((p - goal.position) @ support.normal)
+        if solution.status is not Status.SOLVED or short > FOLLOWED:
+            break
+        nodes.append(solution.q)
+        depths.append(depth)
+    if len(nodes) < 2:
+        return None
+    phase = Phase(
+        kind="swing",
+        q=np.array(nodes),
+        contacts=held,
+        load_before=held,
+        load_after=held,
+    )
+    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).sum(axis=0).max()
+    speed = max(float(travel) * FEELING_SPEED / depths[-1], 1e-3)
+    t = build_trajectory(world, [phase], speed=speed)
+    a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
+    cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
+    return replace(t, time=t.time[: b - a], **cut)
