@@ -5,7 +5,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from scipy.optimize import minimize, nnls
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -14,8 +13,8 @@ from clamber.model import Kinematics, World, build_world, load_robot
 from clamber.posture.ik import (
     DAMPING,
     EDGE_INSET,
-    EQUALITY,
     IK,
+    PENALTY,
     SOFT,
     STEP_ROTATION,
     STEP_TRANSLATION,
@@ -105,9 +104,7 @@ def problem_of(world: World, *goals: ContactGoal, **changes) -> PostureProblem:
 
 
 def hard_rows(qp, nv: int) -> tuple[np.ndarray, np.ndarray]:
-    k = np.flatnonzero(qp.sense == EQUALITY)
-    np.testing.assert_array_equal(qp.lo[k], qp.hi[k])
-    return qp.A[k - nv], qp.lo[k]
+    return qp.C, qp.e
 
 
 def soft_limits(qp, nv: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -687,57 +684,58 @@ def near_solution(plain: IK, problem: PostureProblem, rng) -> np.ndarray:
     return plain.kin.integrate(q, 0.01 * rng.normal(size=plain.world.model.nv))
 
 
-def as_qp(qp, q_limits: tuple[np.ndarray, np.ndarray], nv: int):
-    """min 1/2 x'Hx + c'x, G x <= h, A x = b, lb <= x <= ub as others write it."""
-    k = qp.sense[nv:] == EQUALITY
-    upper, lower = qp.hi[nv:] < 1e29, qp.lo[nv:] > -1e29
-    G = np.concatenate([qp.A[~k & upper], -qp.A[~k & lower]])
-    h = np.concatenate([qp.hi[nv:][~k & upper], -qp.lo[nv:][~k & lower]])
-    return G, h, qp.A[k], qp.lo[nv:][k], *q_limits
+def step_bounds(qp, nv: int) -> tuple[np.ndarray, np.ndarray]:
+    """(nv,) least and largest step: joint limits and the trust region."""
+    step = np.r_[np.full(3, STEP_TRANSLATION), np.full(nv - 3, STEP_ROTATION)]
+    return np.maximum(qp.lo[:nv], -step), np.minimum(qp.hi[:nv], step)
 
 
-def test_a_step_satisfies_the_kkt_conditions(plain, rng):
-    """H x + c + A' y + G' z = 0, z >= 0 on what is active, found by least squares."""
+def penalised(qp, nv: int, x: np.ndarray) -> tuple[float, np.ndarray]:
+    """Model of the merit that a step minimises, and its gradient (nv,)."""
+    open_ = qp.C @ x - qp.e
+    reached = qp.A @ x
+    outside = reached - np.clip(reached, qp.lo[nv:], qp.hi[nv:])
+    value = 0.5 * x @ qp.H @ x + qp.c @ x
+    value += 0.5 * PENALTY * (open_ @ open_ + outside @ outside)
+    slope = qp.H @ x + qp.c + PENALTY * (qp.C.T @ open_ + qp.A.T @ outside)
+    return value, slope
+
+
+def test_a_step_is_where_the_model_of_the_merit_is_least(plain, rng):
+    """Its gradient vanishes but for joints at a bound, which it presses against."""
     nv = plain.world.model.nv
     problem = stance_problem(plain)
     qp = plain.build(problem, near_solution(plain, problem, rng))
     x = plain.step(qp)
-    step = np.r_[np.full(3, STEP_TRANSLATION), np.full(nv - 3, STEP_ROTATION)]
-    bounds = np.maximum(qp.lo[:nv], -step), np.minimum(qp.hi[:nv], step)
-    G, h, A, b, lb, ub = as_qp(qp, bounds, nv)
-    np.testing.assert_allclose(A @ x, b, atol=1e-6)
-    assert np.all(G @ x <= h + 1e-5)
-    assert np.all(x >= lb - 1e-6)
-    assert np.all(x <= ub + 1e-6)
-    active = G[G @ x > h - 1e-5]
-    sides = np.concatenate([np.eye(nv)[x > ub - 1e-6], -np.eye(nv)[x < lb + 1e-6]])
-    columns = np.concatenate([A, -A, active, sides]).T
-    _, residual = nnls(columns, -(qp.H @ x + qp.c), maxiter=2000)
-    assert residual < 1e-5
+    lb, ub = step_bounds(qp, nv)
+    assert np.all(x >= lb - 1e-9)
+    assert np.all(x <= ub + 1e-9)
+    _, slope = penalised(qp, nv, x)
+    low, high = x < lb + 1e-9, x > ub - 1e-9
+    size = PENALTY * np.abs(qp.C.T @ qp.e).max()
+    np.testing.assert_allclose(slope[~low & ~high], 0.0, atol=1e-6 * size)
+    assert np.all(slope[low] >= -1e-6 * size)
+    assert np.all(slope[high] <= 1e-6 * size)
+    np.testing.assert_allclose(qp.C @ x, qp.e, atol=1e-4)  # contacts all but close
 
 
-def test_a_step_is_the_one_that_another_solver_finds(plain, rng):
+def test_the_model_of_the_merit_is_its_derivative(plain, rng):
+    """What makes every short step lower the merit: also where constraints fight."""
     nv = plain.world.model.nv
-    problem = stance_problem(plain)
-    step = np.r_[np.full(3, STEP_TRANSLATION), np.full(nv - 3, STEP_ROTATION)]
-    qp = plain.build(problem, near_solution(plain, problem, rng))
-    x = plain.step(qp)
-    bounds = np.maximum(qp.lo[:nv], -step), np.minimum(qp.hi[:nv], step)
-    G, h, A, b, lb, ub = as_qp(qp, bounds, nv)
-    other = minimize(
-        lambda x: 0.5 * x @ qp.H @ x + qp.c @ x,
-        np.zeros(nv),
-        jac=lambda x: qp.H @ x + qp.c,
-        bounds=list(zip(lb, ub, strict=True)),
-        constraints=[
-            {"type": "eq", "fun": lambda x: A @ x - b, "jac": lambda x: A},
-            {"type": "ineq", "fun": lambda x: h - G @ x, "jac": lambda x: -G},
-        ],
-        method="SLSQP",
-        options={"ftol": 1e-14, "maxiter": 300},
-    )
-    assert other.success
-    np.testing.assert_allclose(x, other.x, atol=1e-5)
+    left, right, hand = stance_problem(plain).goals
+    near = replace(left, position=right.position + np.array([0.0, 0.06, 0.0]))
+    problem = stance_problem(plain, goals=(near, right, hand))
+    q = plain.kin.integrate(plain.world.home, 0.02 * rng.normal(size=nv))
+    qp = plain.build(problem, q)
+    _, slope = penalised(qp, nv, np.zeros(nv))
+    x = plain.step(qp, 0.02)
+    assert slope @ x < 0
+    step = 1e-5 * x / np.abs(x).max()
+    merits = [
+        plain.build(problem, plain.kin.integrate(q, s * step)).merit for s in (1, -1)
+    ]
+    assert (merits[0] - merits[1]) / 2 == pytest.approx(slope @ step, rel=0.02)
+    assert plain.build(problem, plain.kin.integrate(q, x)).merit < qp.merit
 
 
 def test_contacts_that_contradict_one_another_give_a_step_all_the_same(ik):
@@ -989,6 +987,26 @@ def test_solve_hard_never_does_worse(plain):
         hard = plain.solve_hard(problem, plain.world.home)
         assert hard.residuals.worst <= easy.residuals.worst
         assert hard.iterations >= easy.iterations
+
+
+def test_a_hint_is_where_a_hard_solve_begins(plain):
+    problem = stance_problem(plain)
+    there = plain.solve(problem, plain.world.home).q
+    hinted = plain.solve_hard(problem, bent(plain.world, 3), hint=there)
+    assert hinted.iterations == plain.solve(problem, there).iterations
+    wrong = plain.solve_hard(problem, plain.world.home, hint=bent(plain.world, 3))
+    assert wrong.status is Status.SOLVED  # and where it misleads, it does no harm
+
+
+def test_a_leap_that_does_not_pay_off_is_taken_back(plain):
+    """From a posture that is good already, a solve never ends in a worse one."""
+    left, right, hand = stance_problem(plain).goals
+    for shift in (0.03, 0.06, 0.09):
+        near = replace(left, position=right.position + np.array([0.0, shift, 0.0]))
+        problem = stance_problem(plain, goals=(near, right, hand))
+        q = plain.solve(problem, plain.world.home).q
+        before = plain.build(problem, q).merit
+        assert plain.build(problem, plain.solve(problem, q).q).merit <= before + 1e-9
 
 
 def test_an_exact_log_is_used_for_large_turns(ik):

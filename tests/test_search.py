@@ -11,13 +11,14 @@ from clamber import search
 from clamber.contact import Contact, Stance
 from clamber.errors import Status
 from clamber.model import build_world
-from clamber.moves import Move, Step, split_moves
+from clamber.moves import Guide, Move, Step, split_moves
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import KeyframeOptions
 from clamber.scaling import retarget
 from clamber.scene import Box, Scene
 from clamber.se3 import matrix_from_rpy
-from clamber.search import MOVED, plan_step, plan_steps, repair, standing
+from clamber.search import plan_step, plan_steps, repair, standing
+from clamber.transition import MOVED
 
 OPTIONS = KeyframeOptions()
 HEIGHT = 0.275
@@ -210,7 +211,7 @@ def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
     fake = FakePlanner(
         monkeypatch,
         lambda name, tried: name == "c" and "a!" not in tried,
-        lambda limb, paths: (0, contact),
+        lambda limb, paths: ({0: contact}, Guide()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
     assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
@@ -222,7 +223,9 @@ def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
 def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
     contact = fake_steps(("a", 1))[0].move.makes
     fake = FakePlanner(
-        monkeypatch, lambda name, tried: name == "b", lambda limb, paths: (0, contact)
+        monkeypatch,
+        lambda name, tried: name == "b",
+        lambda limb, paths: ({0: contact}, Guide()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert fake.tried.count("b") == search.MAX_REPAIRS + 1
@@ -235,7 +238,7 @@ def test_a_skipped_step_between_does_not_confuse_which_step_is_mended(ik, monkey
     fake = FakePlanner(
         monkeypatch,
         lambda name, tried: name == "a" or (name == "c" and "b!" not in tried),
-        lambda limb, paths: None if limb == "a" else (0, contact),
+        lambda limb, paths: None if limb == "a" else ({0: contact}, Guide()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert fake.tried == ["a", "b", "c", "b!", "c"]
@@ -249,7 +252,7 @@ def test_a_step_skipped_before_and_after_a_repair_is_reported_once(ik, monkeypat
     FakePlanner(
         monkeypatch,
         lambda name, tried: name == "b" or (name == "c" and "a!" not in tried),
-        lambda limb, paths: None if limb == "b" else (0, contact),
+        lambda limb, paths: None if limb == "b" else ({0: contact}, Guide()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 1), ("c", 2)))
     assert [m.reason for m in found.missed] == ["b fails"]
@@ -260,7 +263,7 @@ def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
     FakePlanner(
         monkeypatch,
         lambda name, tried: name in "bc" and "a!" not in tried,
-        lambda limb, paths: None if limb == "b" else (0, contact),
+        lambda limb, paths: None if limb == "b" else ({0: contact}, Guide()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert found.keyframes[1:] == ("a!", "b", "c")

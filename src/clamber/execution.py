@@ -43,13 +43,12 @@ DRIFT = 0.015  # [m] along the support: the rest is planned again
 START_DRIFT = 0.010  # [m] of the start, as far as the arms reach
 MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
-THINKING = 0.6  # [s] the robot stands still while the rest is planned again
+THINKING = 1.0  # [s] the robot stands still while the rest is planned again
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 EASING = 0.5  # [s] from held to self-positioned
 BLEND = 0.3  # [s] back to a trajectory that was left
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SAME_PLACE = 0.05  # [m] a surface that is felt again this near replaces what was felt
-END = 2.0  # [s] the last posture is held
 
 Ticks = Iterator[None]
 
@@ -285,7 +284,7 @@ class Execution:
 
     def _end(self) -> Ticks:
         """Hold the last posture."""
-        n = round(END / PHYSICS_STEP)
+        n = round(HOLD_END / PHYSICS_STEP)
         self._velocity = np.zeros(len(self._dadr))
         for k in range(n):
             self.left = n - 1 - k
@@ -391,8 +390,7 @@ class Execution:
         self._adopt(found.world, found.trajectory, found.keyframes, found.missed)
         self._i = round(HOLD_START / PHYSICS_STEP) - 1
         if steps == 0:  # there is still the way to the last posture
-            hold = round(HOLD_END / PHYSICS_STEP)
-            yield from self._play(len(found.trajectory.time) - 1 - hold)
+            yield from self._play(_arrival(found.trajectory))
 
     def _go_on(self, off: float, why: str) -> Ticks:
         """No other plan was found: the one at hand may do, or may not."""
@@ -596,9 +594,10 @@ def _ankles(world: World) -> dict[str, np.ndarray]:
 
 
 def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
-    """The steps of a trajectory, from its contact flags."""
+    """The steps of a trajectory, from its contact flags; its last hold left out."""
     out = []
-    ends = [t.at(x) for x in t.keyframes]
+    last = _arrival(t)
+    ends = [min(t.at(x), last) for x in t.keyframes]
     for j in range(len(ends) - 1):
         before = {(c.surface, c.support): c for c in keyframes[j].stance}
         after = keyframes[j + 1].stance
@@ -627,6 +626,11 @@ def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
             continue
         out.append(_Leg(ends[j] + int(k[0]), ends[j] + int(k[-1]), ends[j + 1], c))
     return out
+
+
+def _arrival(t: Trajectory) -> int:
+    """The sample from which on the last posture is held."""
+    return len(t.time) - 1 - round(HOLD_END / PHYSICS_STEP)
 
 
 def _yaw(quat: np.ndarray) -> float:

@@ -35,12 +35,32 @@ class Move:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Guide:
+    """Postures (nq,) near those that a move goes through, as far as they are known.
+
+    Attributes:
+        shifted: The weight on the contacts that stay.
+        touching: The new contact closed, not loaded.
+    """
+
+    shifted: np.ndarray | None = None
+    touching: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Step:
-    """A move, and the stance of the demonstration that it leads to."""
+    """A move, and the stance of the demonstration that it leads to.
+
+    Attributes:
+        stance: Index of the stance in the sequence; `target` is it.
+        move: What changes.
+        guide: Where its postures may be found.
+    """
 
     stance: int
     target: Stance
     move: Move
+    guide: Guide = Guide()
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -26,14 +26,15 @@ SAFE_HEIGHT = 0.05  # [m] h_safe of (4.29)
 TOP_RISE = 0.05  # [m] both ends on top: the apex is this and h_safe above them
 ARC_POINTS = 12  # control points of an arc, its ends included; at least five
 BRIDGE_POINTS = 3  # between shift, touch and keyframe, where nothing moves far
-ARC_WEIGHT = 40.0  # of the arc, against posture 0.08 and constraints
+ARC_WEIGHT = 40.0  # of the arc, against posture 0.3 and constraints
+LOOSE_ARC_WEIGHT = 1.0  # ... where a gap is halved, against posture 1
 NODE_ITERATIONS = 25
 BRIDGE_MARGIN = 0.01  # [m] of the centre of mass between two balanced postures
 DRIFT_TOL = 0.002  # [m] contacts that drift by more between two postures refine them
 DRIFT_LIMIT = 0.01  # [m] at most, anywhere on the path
 OVERLAP_TOL = 0.001  # [m] links that enter another by more refine the path
 OVERLAP_LIMIT = 0.004  # [m] at most, anywhere on the path
-MAX_REFINEMENTS = 3  # halvings between two postures
+MAX_REFINEMENTS = 4  # halvings between two postures
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -114,7 +115,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
             taken as it is, for comparison.
     """
     t = transition
-    before, made = (*t.held, *t.leaving), t.held
+    made = t.held
     if t.move.makes:
         made = (*t.held, t.move.makes)
     closed = (*t.held, *t.rolling)
@@ -122,9 +123,9 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     phases = (
         Phase(
             kind="shift",
-            q=bridge(ik, t.before, t.shifted, closed, before),
+            q=bridge(ik, t.before, t.shifted, closed, t.stance),
             contacts=closed,
-            load_before=before,
+            load_before=t.stance,
             load_after=t.held,
         ),
         Phase(
@@ -162,8 +163,8 @@ def bridge(
     """Postures from `a` to `b` with all contacts closed, near the straight way."""
     bearing = {c.surface for c in loaded}
 
-    def node(share: float, last: np.ndarray) -> np.ndarray:
-        q = interpolate(ik.kin, a, b, share)
+    def node(share: float, last: np.ndarray, between: bool) -> np.ndarray:
+        q = last if between else interpolate(ik.kin, a, b, share)
         problem = balance_problem(
             ik.world,
             held=tuple(c for c in contacts if c.surface in bearing),
@@ -195,22 +196,22 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
     shares = np.linspace(0.0, 1.0, len(control))
     rotation = support_rotation(support, made.quaternion)
 
-    def node(share: float, last: np.ndarray) -> np.ndarray:
+    def node(share: float, last: np.ndarray, between: bool) -> np.ndarray:
         goal = ContactGoal(
             surface=made.surface,
             support=made.support,
             position=np.array([np.interp(share, shares, x) for x in control.T]),
             rotation=rotation,
             hard=False,
-            reference=ARC_WEIGHT,
+            reference=LOOSE_ARC_WEIGHT if between else ARC_WEIGHT,
         )
-        reference = interpolate(kin, t.shifted, t.touching, share)
+        reference = last if between else interpolate(kin, t.shifted, t.touching, share)
         problem = balance_problem(
             world,
             held=t.held,
             q_reference=reference,
             extra=(goal,),
-            posture_weight=0.3,
+            posture_weight=1.0 if between else 0.3,
             margin=t.margin if made else BRIDGE_MARGIN,
         )
         if not adapt:
@@ -263,7 +264,7 @@ def _fill(
     a: np.ndarray,
     b: np.ndarray,
     points: int,
-    node: Callable[[float, np.ndarray], np.ndarray],
+    node: Callable[[float, np.ndarray, bool], np.ndarray],
     contacts: tuple[Contact, ...],
     moving: tuple[Contact, ...],
     *,
@@ -271,14 +272,17 @@ def _fill(
 ) -> np.ndarray:
     """(n, nq) postures from `a` to `b`, closer together where it matters.
 
-    A gap is halved while, in its middle, a contact has drifted or links overlap.
+    A gap is halved while, in its middle, a contact has drifted or links overlap. The
+    posture put there is the nearest to the middle that satisfies the constraints: where
+    the limb must pause while the trunk rises, the way leaves the arc.
 
     Args:
         ik: Workspace.
         a: (nq,) first posture.
         b: (nq,) last posture.
         points: Number of postures to begin with, ends included.
-        node: Posture at a share of the way, given the one before.
+        node: Posture at a share of the way, given the one before, or given the middle
+            of a gap (True) that it should stay near.
         contacts: Closed all the way.
         moving: Contacts at either end of the way, which may touch their supports.
         refine: Halve gaps at all.
@@ -286,7 +290,7 @@ def _fill(
     watched = watched_pairs(ik.world, (*contacts, *moving))
     nodes = [(0.0, a)]
     for share in np.linspace(0.0, 1.0, points)[1:-1]:
-        nodes.append((float(share), node(float(share), nodes[-1][1])))
+        nodes.append((float(share), node(float(share), nodes[-1][1], False)))
     nodes.append((1.0, b))
     for _ in range(MAX_REFINEMENTS if refine else 0):
         out = [nodes[0]]
@@ -295,7 +299,7 @@ def _fill(
             depth, _ = overlap(ik, middle, watched)
             if _drift(ik, contacts) > DRIFT_TOL or depth > OVERLAP_TOL:
                 share = 0.5 * (s0 + s1)
-                out.append((share, node(share, q0)))
+                out.append((share, node(share, middle, True)))
             out.append((s1, q1))
         if len(out) == len(nodes):
             break

@@ -70,6 +70,10 @@ class Support:
         """Signed distance (...,) of world points (..., 3) over the plane [m]."""
         return (points - self.position) @ self.normal
 
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """World points (..., 3) moved along the normal onto the plane."""
+        return points - self.height(points)[..., None] * self.normal
+
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
         """Half-planes `A p <= b` of the polygon, A (K, 3) in the world, b (K,)."""
         side = np.roll(self.polygon, -1, axis=0) - self.polygon

@@ -14,7 +14,7 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import Status
-from clamber.moves import Move, Skipped, Step
+from clamber.moves import Guide, Move, Skipped, Step
 from clamber.path import Path, plan_path
 from clamber.posture import direct, gradient, lbfgs
 from clamber.posture.ik import IK, support_rotation
@@ -29,8 +29,9 @@ from clamber.se3 import quat_from_matrix
 from clamber.transition import (
     MARGINS,
     approach_contact,
-    eased_contact,
+    eased_contacts,
     plan_transition,
+    rolled,
 )
 
 METHODS = {
@@ -39,7 +40,6 @@ METHODS = {
     "gradient": gradient.optimise,
 }
 MAX_REPAIRS = 4  # earlier contacts that may be put elsewhere for a later step's sake
-MOVED = 0.005  # [m] a repair by less is none
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -103,12 +103,15 @@ def plan_steps(
             k += 1
             continue
         repairs += 1
-        j, contact = better
+        places, guide = better
+        steps[k] = replace(step, guide=guide)
+        for j, contact in places.items():
+            firm = replace(steps[done[j]].move, makes=contact, firm=True)
+            steps[done[j]] = replace(steps[done[j]], move=firm)
+        j = min(places)
         k = done[j]
         del keyframes[j + 1 :], paths[j:], done[j:]
         missed = {i: m for i, m in missed.items() if i < k}
-        firm = replace(steps[k].move, makes=contact, firm=True)
-        steps[k] = replace(steps[k], move=firm)
     return Found(
         keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed.values())
     )
@@ -151,26 +154,26 @@ def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
 
 def repair(
     ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
-) -> tuple[int, Contact] | None:
-    """Which earlier path should have made its contact elsewhere for `move` to work.
+) -> tuple[dict[int, Contact], Guide] | None:
+    """Which earlier paths should have made their contacts elsewhere for `move` to work.
 
-    Looks at the last contact first.
+    Looks at one contact after the other, the last one first, and then at all at once.
 
     Returns:
-        Index of the path, and the contact at its better place; None where none helps.
+        By index of the path, the contact at its better place, and the posture that
+        `move` then goes through; None where none helps.
     """
     standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
+    made: dict[str, int] = {}
     for j in range(len(paths) - 1, -1, -1):
-        made = paths[j].transition.move.makes
-        if made is None or made.surface not in standing_on:
-            continue
-        standing_on.discard(made.surface)
-        contact = eased_contact(ik, keyframes[-1], move, made.surface)
-        if (
-            contact is not None
-            and np.linalg.norm(contact.position - made.position) > MOVED
-        ):
-            return j, contact
+        new = paths[j].transition.move.makes
+        if new is not None and new.surface in standing_on and new.surface not in made:
+            made[new.surface] = j
+    for surfaces in (*([x] for x in made), list(made)):
+        eased = eased_contacts(ik, keyframes[-1], move, surfaces)
+        if eased is not None:
+            contacts, guide = eased
+            return {made[c.surface]: c for c in contacts}, guide
     return None
 
 
@@ -187,41 +190,64 @@ def plan_step(
     held = tuple(c for c in before.stance if c.surface not in move.breaks)
     if not held:
         return f"{move}: nothing else bears load"
+    result = _plan_on(ik, before, step, held, method, options, lap)
+    if isinstance(result, str) and move.makes:
+        # On tiptoe, feet that stay reach farther.
+        tiptoe = tuple(rolled(ik, before.q, c, move.makes.position) for c in held)
+        if any(a is not b for a, b in zip(held, tiptoe, strict=True)):
+            other = _plan_on(ik, before, step, tiptoe, method, options, lap)
+            if not isinstance(other, str):
+                return other
+    return result
+
+
+def _plan_on(
+    ik: IK,
+    before: Keyframe,
+    step: Step,
+    held: tuple[Contact, ...],
+    method: str,
+    options: KeyframeOptions,
+    lap: Callable[[str], None],
+) -> tuple[Keyframe, Path] | str:
+    """The next keyframe and the path to it on the contacts `held`, or why not."""
+    move = step.move
     task = KeyframeTask(
         held=held,
         new=(move.makes,) if move.makes else (),
         q_reference=before.q,
         directions=step.target.posture,
     )
-    if move.firm and move.makes:
-        key = _keyframe_there(ik, task, move.makes, before.q, method, options)
-    else:
-        key = METHODS[method](ik, task, before.q, options)
-    lap("keyframes")
-    result = _best_margin(ik, before, key, move, lap)
-    if isinstance(result, str) and move.makes:
-        # Put the contact where the unloaded robot reaches it, and optimise around that.
-        wanted = next(c for c in key.stance if c.surface == move.makes.surface)
-        there = _keyframe_there(ik, task, wanted, before.q, method, options)
-        key = replace(
-            there,
-            cost_before=key.cost_before,
-            iterations=key.iterations + there.iterations,
-        )
+    wanted, result = move.makes, "nothing tried"
+    for there in (True, False) if move.firm else (False, True):
+        if wanted is not None and there:
+            # Put the contact where the unloaded robot reaches it.
+            key = _keyframe_there(ik, task, wanted, step, before.q, method, options)
+        else:
+            key = METHODS[method](ik, task, before.q, options)
+            if move.makes is not None:
+                wanted = next(c for c in key.stance if c.surface == move.makes.surface)
         lap("keyframes")
-        result = _best_margin(ik, before, key, move, lap)
-    return result if isinstance(result, str) else (key, result)
+        result = _best_margin(ik, before, key, step, lap)
+        if not isinstance(result, str):
+            return key, result
+        if move.makes is None:
+            break
+    return result
 
 
 def _best_margin(
-    ik: IK, before: Keyframe, key: Keyframe, move: Move, lap: Callable[[str], None]
+    ik: IK, before: Keyframe, key: Keyframe, step: Step, lap: Callable[[str], None]
 ) -> Path | str:
     """The path with the largest of `MARGINS` for which there is one, or why not."""
+    move = step.move
     if key.status is not Status.SOLVED:
         return f"{move}: {key.status.value}"
     reason = ""
     for margin in MARGINS:
-        transition = plan_transition(ik, before, key, move, margin=margin)
+        transition = plan_transition(
+            ik, before, key, move, margin=margin, guide=step.guide
+        )
         lap("transitions")
         if transition.status is not Status.SOLVED:
             reason = f"{move}: {transition.status.value}"
@@ -238,12 +264,13 @@ def _keyframe_there(
     ik: IK,
     task: KeyframeTask,
     wanted: Contact,
+    step: Step,
     q: np.ndarray,
     method: str,
     options: KeyframeOptions,
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
-    contact, solution = approach_contact(ik, task.held, wanted, q)
+    contact, solution = approach_contact(ik, task.held, wanted, q, step.guide.touching)
     fixed = replace(task, new=(contact,), fixed=True)
     key = direct.optimise(ik, fixed, solution.q, options)
     return replace(key, method=method)

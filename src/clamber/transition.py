@@ -8,7 +8,7 @@ centre of mass inside the ellipse of the remaining contacts (4.28).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import World
-from clamber.moves import Move
+from clamber.moves import Guide, Move
 from clamber.posture.ik import (
     IK,
     ContactGoal,
@@ -34,6 +34,7 @@ MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the
 # that can be kept
 ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
 LEAN_WEIGHT = 0.5  # soft task (4.27)
+MOVED = 0.005  # [m] a contact that lies nearer to where it was has not moved
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
 
 
@@ -46,8 +47,9 @@ class Transition:
         before, after: Configurations (nq,) of the keyframes.
         shifted: (nq,) all old contacts closed, weight on those that stay.
         touching: (nq,) the new contact closed, not loaded.
-        held: Contacts that stay.
-        leaving: Contacts that are broken, as they were; `rolling` as they are let go.
+        stance: Contacts at its start.
+        held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
+        rolling: Contacts that are broken, as they are let go.
         margin: Of the centre of mass to the border of its polygon, throughout [m].
         status: Of the worst of its postures, with its residuals.
     """
@@ -57,13 +59,18 @@ class Transition:
     shifted: np.ndarray
     touching: np.ndarray
     after: np.ndarray
+    stance: tuple[Contact, ...]
     held: tuple[Contact, ...]
-    leaving: tuple[Contact, ...]
     rolling: tuple[Contact, ...]
     margin: float
     iterations: int
     status: Status
     residuals: Residuals
+
+    @property
+    def leaving(self) -> tuple[Contact, ...]:
+        """Contacts that are broken, as they were."""
+        return tuple(c for c in self.stance if c.surface in self.move.breaks)
 
 
 def reach_to_support(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -103,7 +110,7 @@ def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
     person gains on tiptoe.
     """
     edges = ik.world.edges[c.surface]
-    if not edges:
+    if not edges or c.edge is not None:
         return c
     ik.kin.update(q)
     normal = ik.world.supports[c.support].normal
@@ -158,7 +165,13 @@ def balance_problem(
 
 
 def plan_transition(
-    ik: IK, before: Keyframe, after: Keyframe, move: Move, *, margin: float
+    ik: IK,
+    before: Keyframe,
+    after: Keyframe,
+    move: Move,
+    *,
+    margin: float,
+    guide: Guide | None = None,
 ) -> Transition:
     """Shift, touch and settle between two keyframes.
 
@@ -168,9 +181,11 @@ def plan_transition(
         after: Keyframe it leads to.
         move: What changes between them.
         margin: Of the centre of mass to the border of its polygon [m].
+        guide: Where its postures may be found.
     """
-    world = ik.world
-    held = tuple(c for c in before.stance if c.surface not in move.breaks)
+    world, guide = ik.world, guide or Guide()
+    new = move.makes.surface if move.makes is not None else None
+    held = tuple(c for c in after.stance if c.surface != new)
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
     middle = np.mean([c.position for c in held], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
@@ -179,13 +194,14 @@ def plan_transition(
             world, held=held, closed=rolling, q_reference=before.q, margin=margin
         ),
         before.q,
+        hint=guide.shifted,
     )
     solutions, touching = [shift], after.q
     if move.makes is not None:
         made = next(c for c in after.stance if c.surface == move.makes.surface)
         move = replace(move, makes=made)
         if shift.status is Status.SOLVED:
-            touch = _touch(ik, held, made, shift.q, after.q, margin)
+            touch = _touch(ik, held, made, shift.q, after.q, margin, guide.touching)
             solutions.append(touch)
             touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
@@ -195,8 +211,8 @@ def plan_transition(
         shifted=shift.q,
         touching=touching,
         after=after.q,
+        stance=before.stance,
         held=held,
-        leaving=leaving,
         rolling=rolling,
         margin=margin,
         iterations=sum(s.iterations for s in solutions),
@@ -212,6 +228,7 @@ def _touch(
     shifted: np.ndarray,
     after: np.ndarray,
     margin: float,
+    hint: np.ndarray | None,
 ) -> Solution:
     """Close the new contact from the loaded posture, the weight still on the rest."""
     world, kin = ik.world, ik.kin
@@ -227,50 +244,97 @@ def _touch(
         margin=margin,
     )
     problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
-    return ik.solve_hard(problem, after)
+    return ik.solve_hard(problem, after, hint=hint)
 
 
-def eased_contact(ik: IK, before: Keyframe, move: Move, surface: str) -> Contact | None:
-    """Where an earlier contact should have been for a move's weight shift to work.
+def eased_contacts(
+    ik: IK, before: Keyframe, move: Move, surfaces: Collection[str]
+) -> tuple[tuple[Contact, ...], Guide] | None:
+    """Where earlier contacts should have been for a move to work.
 
-    Solves the shift with that contact free on its support.
+    Solves the move's weight shift with these contacts free on their supports; where
+    that works as they are, the posture in which the new contact closes.
+
+    Args:
+        ik: Workspace.
+        before: Keyframe it starts from.
+        move: That does not work.
+        surfaces: Whose contacts are free.
 
     Returns:
-        The contact at its better place; None where that does not help either.
+        The contacts at their better places, and the posture found with them; None where
+        that does not help either.
     """
-    world = ik.world
-    held = tuple(c for c in before.stance if c.surface not in (*move.breaks, surface))
+    held = tuple(c for c in before.stance if c.surface not in {*move.breaks, *surfaces})
+    moved = tuple(c for c in before.stance if c.surface in surfaces)
     leaving = tuple(c for c in before.stance if c.surface in move.breaks)
-    moved = next(c for c in before.stance if c.surface == surface)
-    middle = np.mean([c.position for c in (*held, moved)], axis=0)
+    middle = np.mean([c.position for c in (*held, *moved)], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
-    goal = ContactGoal(
-        surface=surface,
-        support=moved.support,
-        position=moved.position,
-        rotation=support_rotation(world.supports[moved.support], moved.quaternion),
-        free=True,
-        reference=1.0,
-    )
-    problem = balance_problem(
-        world,
+    free = tuple(_free_goal(ik, c, 1.0) for c in moved)
+    touching = {c.surface: c.support for c in moved}
+    shift = balance_problem(
+        ik.world,
         held=held,
         closed=rolling,
         q_reference=before.q,
-        extra=(goal,),
-        touching={surface: moved.support},
+        extra=free,
+        touching=touching,
     )
-    solution = ik.solve_hard(problem, before.q)
-    if solution.status is not Status.SOLVED:
-        return None
-    ik.kin.update(solution.q)
-    support = world.supports[moved.support]
-    p = ik.kin.contact_point(surface, support.normal)
-    return replace(moved, position=p - support.normal * support.height(p))
+    problems = {"shifted": shift}
+    if move.makes is not None:
+        new, at = move.makes, move.makes.position
+        problems["touching"] = balance_problem(
+            ik.world,
+            held=tuple(rolled(ik, before.q, c, at) for c in held),
+            q_reference=before.q,
+            extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
+            touching=touching | {new.surface: new.support},
+        )
+    for posture, problem in problems.items():
+        solution = ik.solve_hard(problem, before.q)
+        if solution.status is not Status.SOLVED:
+            return None
+        ik.kin.update(solution.q)
+        eased = tuple(_touching_at(ik, c) for c in moved)
+        if any(
+            np.linalg.norm(a.position - b.position) > MOVED
+            for a, b in zip(eased, moved, strict=True)
+        ):
+            return eased, Guide(**{posture: solution.q})
+    return None
+
+
+def _free_goal(
+    ik: IK, c: Contact, reference: float, *, loaded: bool = True
+) -> ContactGoal:
+    """Closed on its support, near where it is wanted."""
+    return ContactGoal(
+        surface=c.surface,
+        support=c.support,
+        position=c.position,
+        rotation=support_rotation(ik.world.supports[c.support], c.quaternion),
+        free=True,
+        loaded=loaded,
+        reference=reference,
+    )
+
+
+def _touching_at(ik: IK, c: Contact) -> Contact:
+    """The contact where its surface touches the support at the present posture.
+
+    It has not rolled: the posture in which it is made is yet to be found.
+    """
+    support = ik.world.supports[c.support]
+    p = ik.kin.contact_point(c.surface, support.normal)
+    return replace(c, position=support.project(p), link=None)
 
 
 def approach_contact(
-    ik: IK, held: tuple[Contact, ...], wanted: Contact, q: np.ndarray
+    ik: IK,
+    held: tuple[Contact, ...],
+    wanted: Contact,
+    q: np.ndarray,
+    hint: np.ndarray | None = None,
 ) -> tuple[Contact, Solution]:
     """The nearest contact to `wanted` that closes while the others bear the weight.
 
@@ -279,27 +343,15 @@ def approach_contact(
         held: Contacts that stay.
         wanted: Where the contact would be liked.
         q: (nq,) to start from.
+        hint: (nq,) a posture in which a similar contact closes.
     """
-    world = ik.world
-    goal = ContactGoal(
-        surface=wanted.surface,
-        support=wanted.support,
-        position=wanted.position,
-        rotation=support_rotation(world.supports[wanted.support], wanted.quaternion),
-        free=True,
-        loaded=False,
-        reference=APPROACH_WEIGHT,
-    )
     problem = balance_problem(
-        world,
+        ik.world,
         held=held,
         q_reference=q,
-        extra=(goal,),
+        extra=(_free_goal(ik, wanted, APPROACH_WEIGHT, loaded=False),),
         touching={wanted.surface: wanted.support},
     )
-    solution = ik.solve_hard(problem, q)
+    solution = ik.solve_hard(problem, q, hint=hint)
     ik.kin.update(solution.q)
-    support = world.supports[wanted.support]
-    p = ik.kin.contact_point(wanted.surface, support.normal)
-    p = p - support.normal * support.height(p)
-    return replace(wanted, position=p), solution
+    return _touching_at(ik, wanted), solution

@@ -8,9 +8,12 @@ At a configuration q, with the step `dq` in the tangent space as the variable,
           A (p_G + J_G dq) <= b - margin                                balance
           d_i + n_i' (J_2 - J_1) dq >= clearance_i                      distances
 
-then q <- q (+) dq. Contacts and joint limits are hard; balance and distances are
-softened by the solver with a weight of 1e6, so that they give way by micrometres, or
-visibly where nothing satisfies them: `residuals` tells, without the solver.
+then q <- q (+) dq. Joint limits are hard. Contacts, balance and distances weigh 1e6
+against the soft tasks, in the QP as in the merit by which a step is judged: they give
+way by micrometres, or visibly where nothing satisfies them (`residuals` tells, without
+the solver), and each step lowers the merit to first order. With contacts as equalities
+it would not: a step that closed them at the cost of a distance was taken back, and
+solves stalled where everything is tight.
 
 Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 """
@@ -44,7 +47,7 @@ DAMPING = 2e-4  # mu
 NEAR_RANGE = 0.03  # [m] pairs this near always have a row
 SLOW = 0.01  # share of the merit; three steps that gain less end the solve
 MIN_RADIUS = 1e-3  # of the trust region, where the solve has stalled
-PENALTY = 1e6  # of violations against the soft cost, in the merit of a step
+PENALTY = 1e6  # of violations against the soft cost, in the QP and in the merit
 CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
 DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
 BALANCE_TOL = 2e-3  # [m]
@@ -52,7 +55,7 @@ FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
 ROUGHNESS_WEIGHT = 10.0  # soft task: more distance from what is rough
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
-SOFT, EQUALITY = 8, 5  # daqp's constraint types
+SOFT = 8  # daqp's type of a constraint that may give way
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -264,17 +267,18 @@ class _Rows:
 class QP:
     """min 1/2 x'Hx + c'x with bounds on x first, then rows `lo <= A x <= hi`.
 
-    `equalities` rows come first; `merit` is the penalised cost of the configuration it
-    was built at.
+    Contacts are the rows `C x = e`; `merit` is the penalised cost of the configuration
+    it was built at.
     """
 
     H: np.ndarray
     c: np.ndarray
+    C: np.ndarray
+    e: np.ndarray
     A: np.ndarray
     lo: np.ndarray
     hi: np.ndarray
     sense: np.ndarray
-    equalities: int
     merit: float
 
 
@@ -298,7 +302,7 @@ class IK:
         self._dofs, self._angles = _as_slice(world.dadr), _as_slice(world.qadr)
         self._q_min = np.maximum(world.q_min[world.dadr], -1e30)
         self._q_max = np.minimum(world.q_max[world.dadr], 1e30)
-        self._senses: dict[tuple[int, int], np.ndarray] = {}
+        self._senses: dict[int, np.ndarray] = {}
         self._violation = 0.0
         self._edges = {n: s.edges() for n, s in world.supports.items()}
         self._rough = np.zeros(len(world.pairs))
@@ -345,36 +349,33 @@ class IK:
             c[self._dofs] += weight * off
             cost += 0.5 * weight * float(off @ off)
 
-        m = nv + hard.n
-        lo, hi = np.empty(m + ineq.n), np.empty(m + ineq.n)
+        lo, hi = np.empty(nv + ineq.n), np.empty(nv + ineq.n)
         lo[:nv], hi[:nv] = -1e30, 1e30
         now = q[self._angles]
         lo[self._dofs] = np.minimum(self._q_min - now, 0.0)
         hi[self._dofs] = np.maximum(self._q_max - now, 0.0)
-        lo[nv:m] = hi[nv:m] = hard.lo[: hard.n]
-        lo[m:], hi[m:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
+        lo[nv:], hi[nv:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
         return QP(
             H=H,
             c=c,
-            A=np.concatenate((hard.J[: hard.n], ineq.J[: ineq.n])),
+            C=hard.J[: hard.n].copy(),
+            e=hard.lo[: hard.n].copy(),
+            A=ineq.J[: ineq.n].copy(),
             lo=lo,
             hi=hi,
-            sense=self._sense(hard.n, ineq.n),
-            equalities=hard.n,
+            sense=self._sense(ineq.n),
             merit=cost + 0.5 * PENALTY * self._violation,
         )
 
-    def _sense(self, equalities: int, inequalities: int) -> np.ndarray:
-        """(nv + m,) daqp's constraint types: bounds, contacts, softened rows."""
-        key = (equalities, inequalities)
-        if key not in self._senses:
-            counts = (self.world.model.nv, equalities, inequalities)
-            sense = np.repeat(np.array([0, EQUALITY, SOFT], np.int32), counts)
-            self._senses[key] = sense
-        return self._senses[key]
+    def _sense(self, rows: int) -> np.ndarray:
+        """(nv + m,) daqp's constraint types: bounds, then softened rows."""
+        if rows not in self._senses:
+            counts = (self.world.model.nv, rows)
+            self._senses[rows] = np.repeat(np.array([0, SOFT], np.int32), counts)
+        return self._senses[rows]
 
     def step(self, qp: QP, radius: float = 1.0) -> np.ndarray:
-        """Solve; contacts that contradict one another become soft, heavily weighted.
+        """Solve; what cannot all be satisfied is shared out by least squares.
 
         Args:
             qp: From `build`.
@@ -387,24 +388,10 @@ class IK:
         lo, hi = np.minimum(qp.lo, reach), np.maximum(qp.hi, -reach)
         np.maximum(lo[:nv], -step, out=lo[:nv])
         np.minimum(hi[:nv], step, out=hi[:nv])
-        hard = slice(nv, nv + qp.equalities)
-        np.maximum(lo[hard], -reach, out=lo[hard])
-        np.minimum(hi[hard], reach, out=hi[hard])
-        x, _, flag, _ = daqp.solve(qp.H, qp.c, qp.A, hi, lo, qp.sense)
-        if flag > 0:
-            return x
-        m = hard.stop - nv
-        J, e = qp.A[:m], -lo[hard]
-        keep = np.r_[0:nv, nv + m : len(qp.lo)]
-        x, _, flag, _ = daqp.solve(
-            qp.H + 1e4 * J.T @ J,
-            qp.c + 1e4 * J.T @ e,
-            qp.A[m:],
-            hi[keep],
-            lo[keep],
-            qp.sense[keep],
-        )
-        return x if flag > 0 else np.zeros(nv)
+        heavy = PENALTY * qp.C.T
+        H, c = qp.H + heavy @ qp.C, qp.c - heavy @ np.clip(qp.e, -reach, reach)
+        x, _, flag, _ = daqp.solve(H, c, qp.A, hi, lo, qp.sense, rho_soft=1.0 / PENALTY)
+        return np.clip(x, lo[:nv], hi[:nv]) if flag > 0 else np.zeros(nv)
 
     def solve(
         self,
@@ -417,11 +404,35 @@ class IK:
         """Iterate from `q` until the step is below `tolerance`.
 
         A trust region on an exact penalty: a step that raises the merit is taken back
-        and tried again a quarter as long. The first step is always taken: a new contact
-        must be allowed to start.
+        and tried again a quarter as long. The first step is taken all the same: a limb
+        that sets out pays for it at first. Where that has not paid off in the end, the
+        solve begins again without.
         """
+        start = self.build(problem, q)
+        n, converged, x, qp = self._descend(
+            problem, q, start, iterations, tolerance, leap=True
+        )
+        if qp.merit > start.merit:
+            more, converged, x, qp = self._descend(
+                problem, q, start, iterations, tolerance, leap=False
+            )
+            n += more
+        return Solution(
+            q=x, iterations=n, residuals=self.residuals(problem, x), converged=converged
+        )
+
+    def _descend(
+        self,
+        problem: PostureProblem,
+        q: np.ndarray,
+        qp: QP,
+        iterations: int,
+        tolerance: float,
+        *,
+        leap: bool,
+    ) -> tuple[int, bool, np.ndarray, QP]:
+        """Iterations, whether they converged, and where they ended."""
         n, converged, radius, slow = 0, False, 1.0, 0
-        qp = self.build(problem, q)
         for n in range(1, iterations + 1):
             dq = self.step(qp, radius)
             size = float(np.abs(dq).max())
@@ -429,7 +440,7 @@ class IK:
             # The next step will hardly be much longer than this one.
             reach = min(NEAR_RANGE + size, ACTIVE_RANGE)
             new = self.build(problem, trial, reach)
-            if n == 1 or new.merit <= qp.merit:
+            if (leap and n == 1) or new.merit <= qp.merit:
                 gain = qp.merit - new.merit
                 slow = slow + 1 if gain < SLOW * new.merit else 0
                 small = size < tolerance and size < 0.9 * radius * STEP_ROTATION
@@ -440,33 +451,40 @@ class IK:
                 radius *= 0.25
             if converged or radius < MIN_RADIUS:
                 break
-        return Solution(
-            q=q, iterations=n, residuals=self.residuals(problem, q), converged=converged
-        )
+        return n, converged, q, qp
 
-    def solve_hard(self, problem: PostureProblem, q: np.ndarray) -> Solution:
+    def solve_hard(
+        self,
+        problem: PostureProblem,
+        q: np.ndarray,
+        *,
+        hint: np.ndarray | None = None,
+    ) -> Solution:
         """`solve` for postures far from `q`, with more than one way to get there.
 
         Distances make the problem non-convex: from `q`, a limb may be on the wrong side
         of an edge. Where the straight way stalls, the solve is tried again from where
         it stalled, and from the posture that would do if nothing could collide.
+
+        Args:
+            problem: What is wanted.
+            q: (nq,) to start from.
+            hint: (nq,) a posture that solves a similar problem, tried first.
         """
-        first = self.solve(problem, q)
-        if first.status is Status.SOLVED:
-            return first
-        ghost = replace(problem, clearance=np.full(len(problem.clearance), -np.inf))
-        best, iterations = first, first.iterations
-        for start in (first.q, None):
+        best = self.solve(problem, q if hint is None else hint)
+        iterations = best.iterations
+        for start in (best.q, None) if hint is None else (q, best.q, None):
+            if best.status is Status.SOLVED:
+                break
             if start is None:
-                free = self.solve(ghost, q)
+                nothing = np.full(len(problem.clearance), -np.inf)
+                free = self.solve(replace(problem, clearance=nothing), q)
                 iterations += free.iterations
                 start = free.q
             trial = self.solve(problem, start)
             iterations += trial.iterations
             if trial.residuals.worst < best.residuals.worst:
                 best = trial
-            if best.status is Status.SOLVED:
-                break
         return replace(best, iterations=iterations)
 
     def residuals(self, problem: PostureProblem, q: np.ndarray) -> Residuals:

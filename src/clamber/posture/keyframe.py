@@ -156,10 +156,13 @@ def keyframe_problem(
 ) -> PostureProblem:
     """The posture problem of a stance, with `new` as goals of the new contacts."""
     where = {c.surface: c.support for c in (*task.held, *task.new)}
+    rolling = [c.surface for c in task.held if c.edge is not None]
     return PostureProblem(
         goals=(*(held_goal(world, c) for c in task.held), *new),
         q_reference=task.q_reference,
-        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where),
+        clearance=contact_clearance(
+            world, base_clearance(world, CLEARANCE), where, rolling
+        ),
         directions=task.directions,
         direction_weight=options.direction_weight,
         base_rotation=task.base_rotation,
@@ -290,7 +293,7 @@ def finish(
         Contact(
             surface=c.surface,
             support=c.support,
-            position=p,
+            position=world.supports[c.support].project(p),
             quaternion=_orientation(kin, c),
             link=quat_from_matrix(kin.rotation(world.surfaces[c.surface].body)),
         )
