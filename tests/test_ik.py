@@ -711,6 +711,23 @@ def test_far_enough_or_over_a_smooth_box_nothing_is_asked_for(rough, box, height
     np.testing.assert_allclose(qp.H, DAMPING * np.eye(w.model.nv))
 
 
+def test_a_pair_within_range_that_is_far_enough_has_no_part_in_it(rough):
+    """The link's next geom, nearer than the hand should be, but not than it should."""
+    w = rough.world
+    q = hand_over(rough, "yawed", 0.02)
+    body = w.surfaces["LHand"].body
+    names = [w.model.geom(g).name for g in np.flatnonzero(w.model.geom_bodyid == body)]
+    away = {n: gap(w, q, n, "yawed") for n in names if n != "LHand"}
+    other = min(away, key=lambda n: away[n])
+    assert away[other] < 0.04
+    alone = only(w, "LHand", 0.01)
+    both = np.maximum(alone, only(w, other, away[other] - 0.03 - 1e-3))
+    one, two = (rough.build(problem_of(w, clearance=x), q) for x in (alone, both))
+    assert two.merit == one.merit > 0.0
+    np.testing.assert_array_equal(two.H, one.H)
+    np.testing.assert_array_equal(two.c, one.c)
+
+
 def test_pairs_that_do_not_count_do_not_count_as_rough_either(rough):
     w = rough.world
     q = hand_over(rough, "yawed", 0.02)
