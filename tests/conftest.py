@@ -91,6 +91,24 @@ def demo_plan(demo_sequence, coman):
 
 
 @pytest.fixture(scope="session")
+def fast_plan(demo_plan):
+    """The same postures, as fast as joints and contacts bear."""
+    from dataclasses import replace
+
+    from clamber.trajectory import build_trajectory
+
+    counts = [len(path.phases) for path in demo_plan.paths]
+    trajectory = build_trajectory(
+        demo_plan.world,
+        [p for path in demo_plan.paths for p in path.phases],
+        speed="max",
+        keyframe_after=(np.cumsum(counts) - 1).tolist(),
+    )
+    options = replace(demo_plan.options, speed="max")
+    return replace(demo_plan, options=options, trajectory=trajectory)
+
+
+@pytest.fixture(scope="session")
 def demo_rollout(demo_plan):
     """Open loop, by sensors that know everything."""
     from clamber.disturbance import Disturbance

@@ -15,6 +15,7 @@ from clamber.posture.ik import (
     EDGE_INSET,
     IK,
     PENALTY,
+    ROUGHNESS_WEIGHT,
     SOFT,
     STEP_ROTATION,
     STEP_TRANSLATION,
@@ -630,6 +631,154 @@ def test_a_surface_may_touch_the_support_it_stands_on_and_no_other(ik):
     np.testing.assert_array_equal(free, 0.01)
     rolling = contact_clearance(w, free, {"RFoot": "ground"}, rolling=("RFoot",))
     assert sorted(set(rolling.tolist())) == [0.0, 0.01]
+
+
+# Roughness: a soft task of a distance that is wanted, not demanded.
+
+
+@pytest.fixture(scope="module")
+def rough(world) -> IK:
+    """One of the boxes rough by 3 cm, the other smooth."""
+    boxes = tuple(
+        replace(b, roughness=0.03 if b.name == "yawed" else 0.0)
+        for b in world.scene.boxes
+    )
+    return IK(build_world(world.robot, replace(world.scene, boxes=boxes)))
+
+
+def hand_over(ik: IK, box: str, height: float) -> np.ndarray:
+    """(nq,) the left hand so high over the middle of a box; all else is ignored."""
+    q = bent(ik.world, 3)
+    ik.kin.update(q)
+    s = ik.world.supports[box]
+    p = ik.kin.contact_point("LHand", s.normal)
+    q[:3] += s.position + height * s.normal - p
+    return q
+
+
+def only(world: World, geom: str, clearance: float) -> np.ndarray:
+    """(P,) a clearance for the pairs of one geom with the scene alone."""
+    g, fixed = world.model.geom(geom).id, world.model.geom_bodyid == 0
+    mine = (world.pairs == g).any(axis=1) & fixed[world.pairs].any(axis=1)
+    return np.where(mine, clearance, -np.inf)
+
+
+def gap(world: World, q: np.ndarray, geom: str, box: str) -> float:
+    """Distance of two geoms by plain MuJoCo."""
+    m, data = world.model, mujoco.MjData(world.model)
+    data.qpos[:] = q
+    mujoco.mj_kinematics(m, data)
+    return mujoco.mj_geomDistance(m, data, m.geom(geom).id, m.geom(box).id, 1.0, None)
+
+
+@pytest.mark.parametrize("height", [0.012, 0.02, 0.03])
+def test_too_near_what_is_rough_costs_the_square_of_what_is_missing(rough, height):
+    w = rough.world
+    q = hand_over(rough, "yawed", height)
+    problem = problem_of(w, clearance=only(w, "LHand", 0.01))
+    short = 0.01 + 0.03 - gap(w, q, "LHand", "yawed")
+    assert short == pytest.approx(0.04 - height, abs=1e-6)
+    cost = 0.5 * (ROUGHNESS_WEIGHT * short) ** 2
+    assert rough.build(problem, q).merit == pytest.approx(cost, rel=1e-9)
+
+
+def test_the_roughness_row_is_the_gradient_and_curvature_of_that_cost(rough, rng):
+    w, h = rough.world, 1e-4
+    q = hand_over(rough, "yawed", 0.02)
+    problem = problem_of(w, clearance=only(w, "LHand", 0.01))
+    qp = rough.build(problem, q)
+    numeric = jacobian(rough, q, lambda x: rough.build(problem, x).merit, 1e-5)
+    np.testing.assert_allclose(qp.c, numeric, atol=2e-3 * np.abs(numeric).max())
+    # Almost closed, what is left is Gauss-Newton's own curvature.
+    q = hand_over(rough, "yawed", 0.04 - 1e-9)
+    qp = rough.build(problem, q)
+    for v in rng.normal(size=(4, w.model.nv)):
+        low = [rough.build(problem, rough.kin.integrate(q, s * h * v)) for s in (1, -1)]
+        one_sided = max(x.merit for x in low)  # nearer costs, farther does not
+        expected = 0.5 * h**2 * v @ (qp.H - DAMPING * np.eye(w.model.nv)) @ v
+        assert one_sided == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("box", "height"), [("yawed", 0.041), ("yawed", 0.3), ("tilted", 0.02)]
+)
+def test_far_enough_or_over_a_smooth_box_nothing_is_asked_for(rough, box, height):
+    w = rough.world
+    q = hand_over(rough, box, height)
+    qp = rough.build(problem_of(w, clearance=only(w, "LHand", 0.01)), q)
+    assert qp.merit == 0.0
+    assert not qp.c.any()
+    np.testing.assert_allclose(qp.H, DAMPING * np.eye(w.model.nv))
+
+
+def test_a_pair_within_range_that_is_far_enough_has_no_part_in_it(rough):
+    """The link's next geom, nearer than the hand should be, but not than it should."""
+    w = rough.world
+    q = hand_over(rough, "yawed", 0.02)
+    body = w.surfaces["LHand"].body
+    names = [w.model.geom(g).name for g in np.flatnonzero(w.model.geom_bodyid == body)]
+    away = {n: gap(w, q, n, "yawed") for n in names if n != "LHand"}
+    other = min(away, key=lambda n: away[n])
+    assert away[other] < 0.04
+    alone = only(w, "LHand", 0.01)
+    both = np.maximum(alone, only(w, other, away[other] - 0.03 - 1e-3))
+    one, two = (rough.build(problem_of(w, clearance=x), q) for x in (alone, both))
+    assert two.merit == one.merit > 0.0
+    np.testing.assert_array_equal(two.H, one.H)
+    np.testing.assert_array_equal(two.c, one.c)
+
+
+def test_pairs_that_do_not_count_do_not_count_as_rough_either(rough):
+    w = rough.world
+    q = hand_over(rough, "yawed", 0.02)
+    assert rough.build(problem_of(w), q).merit == 0.0
+
+
+def test_a_link_in_contact_with_what_is_rough_is_as_near_as_its_contact(rough):
+    w = rough.world
+    q = hand_over(rough, "yawed", 0.001)
+    wanted = problem_of(w, clearance=only(w, "LHand", 0.0))
+    held = goal_at(rough, q, "LHand", "yawed")
+    touching = contact_clearance(w, wanted.clearance, {"LHand": "yawed"})
+    free = rough.build(wanted, q).merit
+    assert free == pytest.approx(0.5 * (ROUGHNESS_WEIGHT * 0.029) ** 2, rel=1e-3)
+    for clear in (wanted.clearance, touching):
+        problem = replace(wanted, goals=(held,), clearance=clear)
+        assert rough.build(problem, q).merit == pytest.approx(0.0, abs=1e-9)
+    # In contact with another support, or only on its way, it keeps its distance.
+    elsewhere = goal_at(rough, q, "LHand", "ground")
+    for goal in (elsewhere, replace(held, hard=False)):
+        problem = replace(wanted, goals=(goal,))
+        assert rough.build(problem, q).merit == pytest.approx(free, rel=1e-6)
+    other = goal_at(rough, q, "RHand", "ground")
+    problem = replace(wanted, goals=(other,))
+    assert rough.build(problem, q).merit == pytest.approx(free, rel=1e-6)
+
+
+def test_over_what_is_rough_a_limb_keeps_farther_away_where_it_can(plain):
+    """A hand on its way, close to the top: the rougher that is, the higher it goes."""
+    heights = []
+    for roughness in (0.0, 0.02, 0.05):
+        scene = plain.world.scene
+        boxes = tuple(replace(b, roughness=roughness) for b in scene.boxes)
+        ik = IK(build_world(plain.world.robot, replace(scene, boxes=boxes)))
+        problem = stance_problem(ik)
+        feet, hand = problem.goals[:2], problem.goals[2]
+        way = replace(hand, position=hand.position + 0.015 * UP, hard=False)
+        way = replace(way, free=False, loaded=False, reference=5.0)
+        clearance = contact_clearance(
+            ik.world,
+            base_clearance(ik.world, 0.01),
+            {f.surface: "ground" for f in feet},
+        )
+        problem = replace(problem, goals=(*feet, way), clearance=clearance)
+        solution = ik.solve_hard(problem, ik.world.home)
+        assert solution.status is Status.SOLVED
+        heights.append(gap(ik.world, solution.q, "LHand", "box"))
+    assert heights[0] == pytest.approx(0.015, abs=5e-3)
+    assert heights[1] > heights[0] + 0.005
+    assert heights[2] > heights[1] + 0.015
+    assert heights[2] < 0.01 + 0.05 + 1e-3  # but no farther than is asked for
 
 
 # Bounds on joints and steps, and the QP's solution.

@@ -1,12 +1,16 @@
 """Boxes and their supports against geometry by hand; mistakes in files are named."""
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from clamber.errors import InputError
+from clamber.io import scene_fields
 from clamber.scene import GROUND, Box, Scene, Support, load_scene
 from clamber.se3 import matrix_from_rpy
 
@@ -234,6 +238,27 @@ def test_what_a_file_leaves_out_has_a_default(tmp_path):
     assert load_scene(written(tmp_path, "start: [1, 2, 0]\n")).boxes == ()
 
 
+def test_a_box_is_smooth_unless_its_file_says_how_rough_it_is(tmp_path):
+    assert load_scene(written(tmp_path, one_box())).boxes[0].roughness == 0.0
+    (box,) = load_scene(written(tmp_path, one_box(roughness="0.025"))).boxes
+    assert box.roughness == 0.025
+    assert load_scene(written(tmp_path, one_box(roughness="0.1"))).boxes  # the bound
+    smooth = load_scene(written(tmp_path, one_box())).boxes[0].top
+    np.testing.assert_array_equal(box.top.position, smooth.position)  # no offset
+
+
+def test_roughness_survives_the_fields_of_a_written_scene(tmp_path):
+    box = box_at((0.0, 0.0, 0.3))
+    scene = Scene(boxes=(replace(box, roughness=0.017),), start=np.zeros(3))
+    fields = scene_fields(scene)
+    assert [b["roughness"] for b in fields["boxes"]] == [0.017]
+    plain = yaml.safe_dump(json.loads(json.dumps(fields, default=np.ndarray.tolist)))
+    again = load_scene(written(tmp_path, plain))
+    assert again.boxes[0].roughness == 0.017
+    np.testing.assert_allclose(again.boxes[0].position, box.position)
+    np.testing.assert_allclose(again.boxes[0].rotation, box.rotation, atol=1e-12)
+
+
 def test_a_goal_may_leave_the_yaw_open(tmp_path):
     scene = load_scene(written(tmp_path, "goal: [1.6, 0.0]\n"))
     assert scene.goal is not None
@@ -255,6 +280,11 @@ def test_a_goal_may_leave_the_yaw_open(tmp_path):
         (one_box(rpy="[90, 0, 0]"), "boxes.0.rpy.0", "90", "radians"),
         (one_box(friction="-0.1"), "boxes.0.friction", "-0.1", "greater than 0"),
         (one_box(friction="1.5"), "boxes.0.friction", "1.5", "less than or equal to 1"),
+        (one_box(roughness="-0.01"), "boxes.0.roughness", "-0.01", "or equal to 0"),
+        (one_box(roughness="0.11"), "boxes.0.roughness", "0.11", "or equal to 0.1"),
+        (one_box(roughness="25"), "boxes.0.roughness", "25", "or equal to 0.1"),
+        (one_box(roughness=".nan"), "boxes.0.roughness", "nan", "or equal to"),
+        (one_box(roughness="coarse"), "boxes.0.roughness", "coarse", "number"),
         (one_box(colour="red"), "boxes.0.colour", "red", "no such field"),
         (one_box(name="ground"), "boxes", "ground", "different names"),
         (one_box(name="a/b"), "boxes.0.name", "a/b", "pattern"),
