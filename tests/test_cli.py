@@ -20,7 +20,8 @@ import clamber
 from clamber import cli
 
 COMMANDS = (
-    *("climb", "contacts", "plan", "simulate", "render", "scene", "robot", "sweep"),
+    *("climb", "contacts", "plan", "simulate", "render", "export"),
+    *("scene", "robot", "sweep"),
 )
 
 

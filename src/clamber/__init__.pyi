@@ -17,6 +17,8 @@ from clamber.errors import Status as Status
 from clamber.execution import Event as Event
 from clamber.experiment import Spec as Spec
 from clamber.experiment import load_spec as load_spec
+from clamber.export import Exported as Exported
+from clamber.export import export_run as export_run
 from clamber.io import load_plan as load_plan
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder

@@ -384,6 +384,63 @@ class RenderCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExportCommand:
+    """Write the motion of a run for other tools: CSV, MCAP (ROS 2), npz (trainers)."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder that holds a plan."""
+    to: Literal["csv", "mcap", "npz"]
+    """The format."""
+    rate: Annotated[
+        int | None,
+        tyro.conf.arg(
+            metavar="HZ", help_behavior_hint="(default: 100; npz 50; at most 1000)"
+        ),
+    ] = None
+    """Samples per second, a divisor of 1000."""
+    lead_in: Annotated[str | None, tyro.conf.arg(metavar="FILE|home")] = None
+    """Measured joint angles [rad] by name (YAML or JSON), to start from."""
+    lead_in_speed: Annotated[float, tyro.conf.arg(metavar="RAD/S")] = field(
+        default_factory=lambda: import_module("clamber.export").LEAD_IN_SPEED
+    )
+    """Largest joint speed on the way from there to the first posture."""
+    layout: Annotated[
+        Literal["mjlab", "holosoma"] | None,
+        tyro.conf.arg(help_behavior_hint="(default: mjlab; npz alone)"),
+    ] = None
+    """Whose joint_pos and joint_vel an npz holds."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE", help_behavior_hint="(default: RUN/motion.FORMAT)"
+        ),
+    ] = None
+    """The file."""
+    output: Printed
+
+    def run(self) -> int:
+        """Run folder to a file."""
+        done = clamber.export_run(
+            self.run_folder,
+            to=self.to,
+            out=self.out,
+            rate=self.rate,
+            lead_in=self.lead_in,
+            lead_in_speed=self.lead_in_speed,
+            layout=self.layout,
+        )
+        parts = [f"{done.samples} samples at {done.rate} Hz"]
+        if done.lead_in:
+            parts.append(f"the first {done.lead_in:.2f} s lead in")
+        parts.append(
+            "with contact forces" if done.forces else "no forces: not simulated"
+        )
+        note = f"{done.file}: {', '.join(parts)}"
+        self.output.show({**asdict(done), "file": str(done.file)}, note=note)
+        return REACHED
+
+
+@dataclass(frozen=True, kw_only=True)
 class SceneCommand:
     """Check a scene file and say what is in it."""
 
@@ -530,6 +587,7 @@ Command = (
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
     | Annotated[SweepCommand, tyro.conf.subcommand("sweep")]
