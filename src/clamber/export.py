@@ -14,6 +14,7 @@ import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -280,13 +281,13 @@ def measured_posture(
     for i, name in enumerate(world.joints):
         low, high = (x[world.dadr[i]] for x in (world.q_min, world.q_max))
         x = angles[name]
-        number = isinstance(x, int | float) and not isinstance(x, bool)
+        number = isinstance(x, Real) and not isinstance(x, bool)
         if not number or not low <= x <= high:  # NaN is not either
             raise InputError(
                 f"{low:.4g} to {high:.4g} rad, its limits",
                 source=source,
                 field=name,
-                value=x,
+                value="nothing" if x is None else x,
             )
         out[i] = x
     return out
@@ -372,9 +373,10 @@ def _check_lead_in(motion: Motion, plan: Plan, measured: np.ndarray) -> None:
         if len(near.distance):
             i = int(np.argmin(near.distance))
             a, b = (world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]])
+            where = f"after {100 * share:.0f} % of the way" if share else "in it"
             raise InputError(
                 "a measured posture from which the first one is reached in a straight"
-                f" line: {a} and {b} would meet after {100 * share:.0f} % of the way",
+                f" line: {a} and {b} would meet {where}",
                 source="--lead-in",
             )
 
