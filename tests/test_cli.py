@@ -249,7 +249,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         monkeypatch.setitem(vars(clamber), name, stage)
 
     for name, result in {
-        "load_demo": "demo",
+        "load_demo": SimpleNamespace(notes=("recognised: SMPL", "up: y")),
         "detect_contacts": sequence,
         "new_run_folder": tmp_path / "run",
         "load_sequence": sequence,
@@ -406,8 +406,26 @@ def test_contacts_lists_the_stances_it_found(
     stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ):
     assert cli.main(["contacts", "mine.yaml"]) == 0
-    row = capsys.readouterr().out.splitlines()[1].split()
-    assert row == ["0", "O", "0.00", "1.50", "LHand", "on", "table"]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["0", "O", "0.00", "1.50", "LHand", "on", "table"]
+    assert lines[2:4] == ["recognised: SMPL", "up: y"]
+
+
+def test_contacts_says_by_how_much_the_floor_was_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    from dataclasses import replace
+
+    import numpy as np
+
+    demo = clamber.load_demo("climb")
+    lifted = replace(demo, position=demo.position + np.array([0.0, 0.0, 0.035]))
+    clamber.write_c3d(lifted, tmp_path / "take.c3d")
+    out = ["--out", str(tmp_path / "out"), "--json"]
+    assert cli.main(["contacts", str(tmp_path / "take.c3d"), "--fit-floor", *out]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    assert "clamber's own points" in notes[0]
+    assert any(n.startswith("fitted: ground +35 mm (foot at rest") for n in notes)
 
 
 def test_render_names_its_files(
@@ -447,7 +465,7 @@ def spoiled_robot(folder: Path) -> Path:
         ("no.npy", None, "no.npy"),
         ("film.mp4", "", "film.mp4"),
         ("joints.npy", "no array", "joints.npy"),
-        ("recording.yaml", RECORDING.format(unit="inch"), "unit is 'inch'"),
+        ("recording.yaml", RECORDING.format(unit="ell"), "unit"),
         ("recording.yaml", "- a\n- b\n", "recording.yaml"),
         ("recording.yaml", RECORDING.format(unit="m"), "joints.npy"),
     ],

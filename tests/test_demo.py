@@ -15,7 +15,7 @@ import yaml
 from clamber.demo import PARTS, ClimbOptions, Demonstration, load_demo, synthesize_climb
 from clamber.demo.boxes import read_obj_boxes
 from clamber.demo.demonstration import build_demonstration, runs
-from clamber.demo.skeleton import canonical_columns
+from clamber.demo.marker_sets import recognise
 from clamber.errors import InputError
 from clamber.scene import Scene
 from clamber.se3 import matrix_from_rpy
@@ -213,7 +213,7 @@ def test_a_finger_that_stands_for_the_hand_does_not_lengthen_the_forearm(write):
     ids=["mixamo", "smpl", "short"],
 )  # fmt: skip
 def test_common_skeletons_are_recognised(names):
-    columns = canonical_columns(names, None, "test")
+    columns = {k: c[0] for k, c in recognise(names).columns.items()}
     for s, k in (("L", 1), ("R", 8)):
         order = ("Shoulder", "Elbow", "Hand", "Hip", "Knee", "Foot", "Foot.toe")
         assert [columns[s + n] for n in order] == list(range(k, k + 7))
@@ -256,17 +256,25 @@ def test_a_wrong_field_is_named(write, case):
     ("array", "word"),
     [
         (np.zeros((10, 15)), r"samples, points, 3"),
-        (np.zeros((0, 15, 3)), r"samples, points, 3"),
+        (np.zeros((0, 15, 3)), "two samples"),
         (np.full((30, 15, 3), np.nan), "not NaN"),
         (np.full((30, 15, 3), "x"), "numbers"),
-        (1000.0 * standing(), "unit: mm"),
-        (100.0 * standing(), "unit: cm"),
+        (2.5 * standing(), "unit"),
     ],
-    ids=["flat", "empty", "nan", "text", "millimetres", "centimetres"],
+    ids=["flat", "empty", "nan", "text", "giant"],
 )
 def test_a_wrong_array_is_refused_with_the_reason(write, array, word):
     with pytest.raises(InputError, match=word):
         load_demo(write(array))
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1000.0), ("cm", 100.0)])
+def test_a_unit_that_is_not_said_is_told_from_the_shank(write, unit, scale):
+    demo = load_demo(write(scale * standing()))
+    np.testing.assert_allclose(demo.position, load_demo(write()).position, atol=1e-9)
+    assert any(f"so these are {unit}" in n for n in demo.notes)
+    with pytest.raises(InputError, match=f"unit: {unit}"):
+        load_demo(write(scale * standing(), unit="m"))
 
 
 @pytest.mark.parametrize(
@@ -321,7 +329,7 @@ def test_a_demonstration_keeps_its_arrays(write):
 def test_a_point_never_seen_is_dropped_unless_it_is_needed():
     p = standing()
     p[:, NAMES.index("LeftToeBase")] = np.nan
-    columns = canonical_columns(NAMES, None, "x")
+    columns = {k: c[0] for k, c in recognise(NAMES).columns.items()}
     demo = build_demonstration(
         p[:, list(columns.values())], names=list(columns), rate=30.0,
         scene=Scene(start=np.zeros(3)), source="x",

@@ -11,7 +11,13 @@ import pytest
 import yaml
 
 from clamber.contact import DIRECTIONS, ContactInterval, ContactSequence
-from clamber.demo import ClimbOptions, Demonstration, load_demo, synthesize_climb
+from clamber.demo import (
+    ClimbOptions,
+    Demonstration,
+    build_demonstration,
+    load_demo,
+    synthesize_climb,
+)
 from clamber.detect import (
     SEAT,
     DetectOptions,
@@ -216,6 +222,47 @@ def test_a_standing_knee_over_a_low_box_does_not_kneel():
     still = replace(demo, position=np.repeat(demo.position[:1], len(demo.t), axis=0))
     found = detect_contacts(still, scene=Scene(boxes=boxes, start=np.zeros(3)))
     assert not [i for i in found.intervals if i.part.endswith("Knee")]
+
+
+def test_a_hand_that_rolls_up_after_it_has_touched_is_found_when_it_touches():
+    demo, truth = climb(noise=0.001, gaps=0)
+    p = demo.position.copy()
+    true = {(i.part, i.contact.support): i for i in truth}["LHand", "table"]
+    since = np.clip((demo.t - true.t0) / 0.5, 0.0, 1.0)
+    for f, name in enumerate(demo.names):
+        if name.startswith("LHand"):
+            p[:, f, 2] += 0.03 * since**2 * (3 - 2 * since)
+    found = detect_contacts(replace(demo, position=p))
+    (hand,) = [i for i in found.intervals if i.part == "LHand"]
+    assert abs(hand.t0 - true.t0) < 0.1
+
+
+@pytest.mark.parametrize("size", [0.6, 1.2])
+def test_a_person_of_another_size_makes_the_same_contacts(size):
+    demo, truth = climb(noise=0.001, gaps=0)
+    box = demo.scene.boxes[0]
+    scene = Scene(
+        boxes=(replace(box, size=size * box.size, position=size * box.position),),
+        start=demo.scene.start,
+    )
+    scaled = build_demonstration(
+        size * demo.position, names=demo.names, rate=demo.rate, scene=scene, source="x"
+    )
+    assert scaled.offsets["Knee"] == pytest.approx(size * demo.offsets["Knee"])
+    assert np.abs(errors(detect_contacts(scaled), truth)).max() < 0.06
+
+
+def test_offsets_move_the_heights_at_which_a_part_may_rest():
+    """Knees whose points lie 9 cm higher than usual, as on thick pads."""
+    demo, truth = climb(noise=0.001, gaps=0)
+    p = demo.position.copy()
+    for side in "LR":
+        p[:, demo.names.index(side + "Knee"), 2] += 0.09
+    padded = replace(demo, position=p)
+    parts = {i.part for i in detect_contacts(padded).intervals}
+    assert not parts & {"LKnee", "RKnee"}
+    told = replace(padded, offsets={**demo.offsets, "Knee": 0.20})
+    assert np.abs(errors(detect_contacts(told), truth)).max() < 0.06
 
 
 def test_a_hand_that_rests_in_the_air_touches_nothing():

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from clamber.contact import Contact
 from clamber.errors import Status
-from clamber.model import World, build_world, load_robot
+from clamber.model import Kinematics, World, build_world, load_robot
 from clamber.posture import direct, gradient, lbfgs
 from clamber.posture.alternating import Alternation
 from clamber.posture.ik import EDGE_INSET, IK, ContactGoal
@@ -20,6 +20,9 @@ from clamber.posture.keyframe import (
     KeyframeTask,
     contact_drift,
     contact_state,
+    equilibrium_at,
+    finish,
+    holds,
     keyframe_problem,
     new_positions,
     prescribed_goals,
@@ -189,9 +192,9 @@ def test_what_a_keyframe_says_is_so_in_plain_mujoco(ik, results, name):
     data = located(ik.world, k.q)
     hand = k.contacts[-1]
     np.testing.assert_allclose(
-        hand.contact.position, data.geom("LHand").xpos - 0.02 * UP, atol=1e-9
+        hand.contact.position, data.geom("LHand").xpos - 0.02 * UP, atol=5e-4
     )
-    assert hand.contact.position[2] == pytest.approx(0.275, abs=5e-4)
+    assert hand.contact.position[2] == pytest.approx(0.275, abs=1e-12)
     assert hand.contact.link is not None
     R = Rotation.from_quat(hand.contact.link, scalar_first=True).as_matrix()
     np.testing.assert_allclose(R, data.body("LElb").xmat.reshape(3, 3), atol=1e-9)
@@ -224,9 +227,10 @@ def test_the_forces_that_hold_it_up_add_up_to_its_weight(ik, results, name):
     np.testing.assert_allclose(total, [0, 0, ik.world.mass * GRAVITY], atol=1e-3)
 
 
-def test_both_outer_methods_find_about_the_same_contact(results):
-    a, b = (results[n].contacts[-1].contact.position for n in OUTER)
-    assert np.linalg.norm(a - b) < 0.03
+def test_both_outer_methods_find_about_the_same_cost(results):
+    """Along a valley of it: the hand may be anywhere that the shoulder can be."""
+    a, b = (results[n].cost_after for n in OUTER)
+    assert a == pytest.approx(b, abs=1e-3 * results["lbfgs"].cost_before)
     assert results["lbfgs"].iterations < results["gradient"].iterations
 
 
@@ -447,8 +451,39 @@ def test_the_drift_of_a_contact_is_zero_where_it_was_made(ik, results):
     k = results["direct"]
     ik.kin.update(k.q)
     hand = k.contacts[-1].contact
-    assert contact_drift(ik.kin, hand) == pytest.approx(0.0, abs=1e-9)
+    assert contact_drift(ik.kin, hand) == pytest.approx(0.0, abs=1e-5)
     q = k.q.copy()
     q[:3] += [0.003, 0.0, 0.004]
     ik.kin.update(q)
-    assert contact_drift(ik.kin, hand) == pytest.approx(0.005, abs=1e-9)
+    assert contact_drift(ik.kin, hand) == pytest.approx(0.005, abs=1e-5)
+
+
+def test_a_contact_that_does_not_reach_its_support_is_open(ik):
+    """The home posture, said to have a hand on the box that it does not touch."""
+    task = task_of(ik, on_box("LHand", 0.43, 0.17))
+    home = ik.world.home
+    k = finish(
+        ik,
+        task,
+        KeyframeOptions(),
+        home,
+        method="none",
+        iterations=0,
+        cost_before=0.0,
+    )
+    assert k.status is Status.UNREACHABLE
+    gap = located(ik.world, home).geom("LHand").xpos[2] - 0.02 - 0.275
+    assert gap > 0.1
+    assert k.residuals.contact == pytest.approx(gap, abs=1e-9)
+    assert k.contacts[-1].contact.position[2] == pytest.approx(0.275, abs=1e-12)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3, 0.05, 0.01])
+def test_what_holds_is_what_the_margin_says(ik, results, share):
+    """Weaker and weaker joints: both checks turn at the same place."""
+    k = results["direct"]
+    weak = replace(ik.world, tau_max=share * ik.world.tau_max)
+    kin = Kinematics(weak)
+    kin.update(k.q)
+    assert holds(kin, k.stance) == equilibrium_at(kin, k.stance).feasible
+    assert holds(kin, k.stance) == (share >= 0.3)

@@ -327,3 +327,18 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
     (tmp_path / "image.yaml").write_bytes(b"\x89PNG\xff\xfe\x00")
     with pytest.raises(InputError, match="YAML"):
         load_scene(tmp_path / "image.yaml")
+
+
+def test_points_are_projected_along_the_normal(rng):
+    rotation = matrix_from_rpy([0.3, -0.2, 0.5])
+    box = Box(
+        name="box",
+        size=np.array([1.0, 0.8, 0.4]),
+        position=np.array([0.2, 0.1, 0.5]),
+        rotation=rotation,
+    )
+    points = rng.normal(size=(5, 3))
+    on = box.top.project(points)
+    np.testing.assert_allclose(box.top.height(on), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.cross(points - on, rotation[:, 2]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(box.top.project(points[0]), on[0])

@@ -12,6 +12,7 @@ from clamber.contact import Contact, Stance
 from clamber.errors import Status
 from clamber.model import build_world
 from clamber.moves import Guide, Move, Step, split_moves
+from clamber.pipeline import plan
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import KeyframeOptions
 from clamber.scaling import retarget
@@ -268,3 +269,40 @@ def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert found.keyframes[1:] == ("a!", "b", "c")
     assert found.missed == ()
+
+
+def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkeypatch):
+    tried = []
+
+    def planner(ik, before, step, held, method, options, lap):
+        tried.append(held)
+        flat = all(c.edge is None for c in held)
+        return "too far" if flat else ("keyframe", "path")
+
+    monkeypatch.setattr(search, "_plan_on", planner)
+    start = standing(ik, OPTIONS)
+    found = plan_step(ik, start, steps[0], "direct", OPTIONS, quiet)
+    assert found == ("keyframe", "path")
+    assert tried[0] == start.stance
+    toes = max(ik.kin.bearing_points("LFoot", np.array([0.0, 0.0, 1.0]))[:, 0])
+    for c in tried[1]:
+        assert c.edge is not None
+        assert c.position[0] == pytest.approx(toes, abs=1e-6)
+
+
+def test_the_reason_is_that_of_flat_feet_where_tiptoe_does_not_help(
+    ik, steps, monkeypatch
+):
+    reasons = iter(["flat", "tiptoe"])
+    monkeypatch.setattr(search, "_plan_on", lambda *_: next(reasons))
+    start = standing(ik, OPTIONS)
+    assert plan_step(ik, start, steps[0], "direct", OPTIONS, quiet) == "flat"
+
+
+def test_a_box_higher_than_flat_feet_reach_is_climbed_on_tiptoe(coman, demo_sequence):
+    found = plan(demo_sequence, coman, Scene.from_height(0.56))
+    assert found.complete
+    assert all(k.equilibrium.feasible for k in found.keyframes)
+    tiptoe = [c for p in found.paths for c in p.transition.held if c.edge is not None]
+    assert {c.surface for c in tiptoe} <= {"LFoot", "RFoot"}
+    assert {c.support for c in found.keyframes[-1].stance} == {"box"}

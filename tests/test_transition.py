@@ -216,6 +216,26 @@ def test_a_foot_rolls_onto_its_heel_where_the_others_are_behind(ik, demo_plan):
     )
 
 
+def test_a_foot_on_an_edge_stays_on_it(ik, demo_plan):
+    home = demo_plan.keyframes[0]
+    foot = home.stance[0]
+    tiptoe = rolled(ik, home.q, foot, foot.position + 0.4 * AHEAD)
+    assert rolled(ik, home.q, tiptoe, foot.position - 0.4 * AHEAD) is tiptoe
+
+
+def test_joints_too_weak_for_a_shift_are_named(demo_plan, ik):
+    """The same postures, but motors that cannot hold them."""
+    before, after = demo_plan.keyframes[4:6]
+    move = demo_plan.paths[4].transition.move
+    weak = IK(replace(ik.world, tau_max=0.05 * ik.world.tau_max))
+    strong, feeble = (
+        plan_transition(x, before, after, move, margin=0.025) for x in (ik, weak)
+    )
+    assert strong.status is Status.SOLVED
+    assert feeble.status is Status.OVERLOADED
+    assert np.array_equal(strong.shifted, feeble.shifted)
+
+
 def test_a_round_surface_does_not_roll_onto_an_edge(ik, demo_plan):
     last = demo_plan.keyframes[-1]
     elbow = last.stance[0]

@@ -60,6 +60,8 @@ _HOME = {
     "save_sequence": "io",
     "save_verdict": "io",
     "simulate": "simulation",
+    "write_c3d": "demo",
+    "write_trc": "demo",
 }
 
 __all__ = ["__version__", *_HOME]

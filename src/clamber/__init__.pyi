@@ -5,6 +5,8 @@ from clamber.contact import Stance as Stance
 from clamber.curves import save_curves as save_curves
 from clamber.demo import Demonstration as Demonstration
 from clamber.demo import load_demo as load_demo
+from clamber.demo import write_c3d as write_c3d
+from clamber.demo import write_trc as write_trc
 from clamber.detect import detect_contacts as detect_contacts
 from clamber.disturbance import Disturbance as Disturbance
 from clamber.errors import ClamberError as ClamberError

@@ -232,6 +232,8 @@ class ClimbCommand:
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
     """A recording, or the built-in demonstration (climb)."""
+    fit_floor: bool = False
+    """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
@@ -248,9 +250,9 @@ class ClimbCommand:
         with self.output.progress() as show:
             report = clock.watching(show)
             report("detect", 0.0, "")
-            demo = clamber.load_demo(self.demo)
+            demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
             sequence = clamber.detect_contacts(demo)
-            report("detect", 1.0, "")
+            report("detect", 1.0, "; ".join(demo.notes[:1]))
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():
@@ -280,6 +282,8 @@ class ContactsCommand:
     """A recording, recording.yaml, or a built-in demonstration by name."""
     scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The scene.yaml it was recorded in, where the recording has none."""
+    fit_floor: bool = False
+    """Correct the heights of floor and boxes by what rests on them."""
     out: Place = None
     """The run folder (runs/contacts, then runs/contacts-2 ...)."""
     output: Printed
@@ -289,9 +293,10 @@ class ContactsCommand:
         scene = None if self.scene is None else clamber.load_scene(self.scene)
         with self.output.progress() as report:
             report("detect", 0.0, "")
-            sequence = clamber.detect_contacts(
-                clamber.load_demo(self.recording, scene=scene)
+            demo = clamber.load_demo(
+                self.recording, scene=scene, fit_floor=self.fit_floor
             )
+            sequence = clamber.detect_contacts(demo)
             folder = clamber.new_run_folder(self.out, "contacts")
             clamber.save_sequence(sequence, folder / "sequence.json")
         table = _table("stance", "region", "from [s]", "to [s]", "contacts")
@@ -299,8 +304,13 @@ class ContactsCommand:
             on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
             t0, t1 = sequence.t[i], sequence.t[i + 1]
             table.add_row(str(i), stance.region, f"{t0:.2f}", f"{t1:.2f}", on)
-        record = {"out": str(folder), "stances": len(sequence.stances)}
-        self.output.show(record, table, note=f"the sequence is in {folder}")
+        record = {
+            "out": str(folder),
+            "stances": len(sequence.stances),
+            "notes": list(demo.notes),
+        }
+        note = "\n".join([*demo.notes, f"the sequence is in {folder}"])
+        self.output.show(record, table, note=note)
         return REACHED
 
 

@@ -22,7 +22,14 @@ from itertools import pairwise
 import numpy as np
 
 from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
-from clamber.demo.demonstration import PARTS, SIDES, Demonstration, runs, wrist
+from clamber.demo.demonstration import (
+    PARTS,
+    SIDES,
+    Demonstration,
+    estimate_offsets,
+    runs,
+    wrist,
+)
 from clamber.errors import InputError
 from clamber.scene import Scene, Support
 from clamber.se3 import frame_from_normal, quat_from_matrix
@@ -71,6 +78,7 @@ class _Window:
 
 # By part without side and, after the dot, by point. `Hand` alone stands for a wrist, or
 # for whatever single point there is of a hand; with fingers, the fingers count.
+# For a person of `_SIZE`; another's windows move as much as the offsets differ.
 # A rigid hand's fingertips dip below the surface when the palm is bent back.
 _WINDOWS = {
     "Hand": _Window(-0.10, 0.17, 0.07),
@@ -80,6 +88,7 @@ _WINDOWS = {
     "Foot": _Window(0.0, 0.13, 0.05),
     "Foot.": _Window(-0.04, 0.09, 0.05),
 }
+_SIZE = {"forearm": 0.254, "thigh": 0.373, "shank": 0.453}  # [m]
 _PLATEAU = 10  # [%] the percentile of resting heights that is the lowest plateau
 _BELOW = 0.04  # [m] under the plateau it is no longer the same thing at rest
 _UNDER = -0.15  # [m] deeper than this, a point is under the support, not on it
@@ -208,9 +217,13 @@ def _kind(point: str) -> str:
     return point[1:]
 
 
-def _window(point: str) -> _Window:
-    part, dot, _ = _kind(point).partition(".")
-    return _WINDOWS[part + dot]
+def _window(demo: Demonstration, point: str) -> _Window:
+    kind = _kind(point)
+    part, dot, _ = kind.partition(".")
+    usual = estimate_offsets(_SIZE, {}).get(kind, 0.0)
+    shift = demo.offsets.get(kind, usual) - usual
+    w = _WINDOWS[part + dot]
+    return _Window(w.low + shift, w.high + shift, w.spread)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -312,7 +325,7 @@ def _calibrate(
     """Windows by kind of point, narrowed to the lowest plateau of either side."""
     resting: dict[str, list[np.ndarray]] = {}
     for point, over in near.items():
-        w = _window(point)
+        w = _window(tracks.demo, point)
         slow = tracks.speed[:, tracks.demo.names.index(point)] < options.enter_speed
         for n in over:
             at_rest = n.possible & slow & (n.height > w.low) & (n.height < w.high)
@@ -320,7 +333,7 @@ def _calibrate(
     enough = options.min_duration * tracks.demo.rate
     out = {}
     for kind, several in resting.items():
-        w, heights = _window("L" + kind), np.concatenate(several)
+        w, heights = _window(tracks.demo, "L" + kind), np.concatenate(several)
         if len(heights) >= enough:
             plateau = float(np.percentile(heights, _PLATEAU))
             low = max(w.low, plateau - _BELOW)
@@ -426,7 +439,7 @@ def _refine(
     rest = np.median(raw_height[ahead : min(ahead + round(_REST * rate), j)])
     still = max(_STILL, 4.5 * _noise(raw) / 2.0)  # smoothing halves the noise
     start = max(i - round(_AROUND * rate), 0)
-    away = np.abs(height[start : ahead + 1] - rest) > still
+    away = height[start : ahead + 1] - rest > still  # no part rests above its place
     moving = np.flatnonzero(away)
     k = start + int(moving[-1]) if len(moving) else i
     k = _fit_instant(raw, min(k, ahead), round(_AROUND * rate))

@@ -27,7 +27,7 @@ from clamber.posture.ik import (
     contact_clearance,
     support_rotation,
 )
-from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
+from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal, holds
 
 REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
 MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
@@ -51,7 +51,8 @@ class Transition:
         held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
         rolling: Contacts that are broken, as they are let go.
         margin: Of the centre of mass to the border of its polygon, throughout [m].
-        status: Of the worst of its postures, with its residuals.
+        status: Of the worst of its postures, with its residuals; OVERLOADED where the
+            contacts that stay and the joints cannot hold one of them.
     """
 
     move: Move
@@ -205,6 +206,11 @@ def plan_transition(
             solutions.append(touch)
             touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
+    status = worst.status
+    for s in solutions if status is Status.SOLVED else ():
+        ik.kin.update(s.q)
+        if not holds(ik.kin, held):
+            status = Status.OVERLOADED
     return Transition(
         move=move,
         before=before.q,
@@ -216,7 +222,7 @@ def plan_transition(
         rolling=rolling,
         margin=margin,
         iterations=sum(s.iterations for s in solutions),
-        status=worst.status,
+        status=status,
         residuals=worst.residuals,
     )
 

@@ -1,22 +1,27 @@
 """Demonstrations: recordings of people, read from disk or made by the built-in one.
 
-One file per format; all of them end in a `Demonstration`.
+One file per format; all of them end in named `Points`, and these in a `Demonstration`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from clamber.demo.arrays import load_array, load_recording
+from clamber.demo.c3d import write_c3d
 from clamber.demo.demonstration import (
     PARTS,
     Demonstration,
     Gap,
     build_demonstration,
 )
+from clamber.demo.levels import Level, find_levels, fit_levels
+from clamber.demo.points import Points
+from clamber.demo.recording import SUFFIXES, load_recording, read_points
 from clamber.demo.synthetic import ClimbOptions, synthesize_climb
+from clamber.demo.trc import write_trc
 from clamber.errors import InputError
 from clamber.scene import Scene
 
@@ -26,49 +31,58 @@ __all__ = [
     "ClimbOptions",
     "Demonstration",
     "Gap",
+    "Level",
+    "Points",
     "build_demonstration",
+    "find_levels",
+    "fit_levels",
     "load_demo",
+    "read_points",
     "synthesize_climb",
+    "write_c3d",
+    "write_trc",
 ]
 
 BUILT_IN = ("climb",)
 _SEED = 20  # of the built-in demonstration: the same one everywhere, always
-_FORMATS = (".yaml", ".yml", ".npy", ".npz")
 
 
 def load_demo(
     path_or_name: str | Path,
     *,
     scene: Scene | None = None,
-    names: str | Path | list[str] | None = None,
+    names: str | Path | Sequence[str] | None = None,
     rate: float | None = None,
     span: tuple[float, float] | None = None,
+    fit_floor: bool = False,
 ) -> Demonstration:
     """Read a recording, or take the built-in one by its name.
 
     Args:
         path_or_name: `climb` for the built-in synthetic one, a `recording.yaml`, or a
-            bare array (`.npy`, or `.npz` with `positions`, `names` and `rate`).
+            recording: C3D, TRC, BVH, Motive's CSV, or an array (`.npy`, or `.npz` with
+            `positions`, `names` and `rate`).
         scene: Replaces the boxes of the recording, in its coordinates.
         names: Of the columns of a bare array: a list, or a JSON file with one.
-        rate: Of a bare array [Hz].
+        rate: Of a bare array, or in place of the file's own [Hz].
         span: Part of the recording to keep [s]; of a `recording.yaml`, its own by
             default.
+        fit_floor: Correct the heights of floor and boxes by what rests on them.
 
     Raises:
         InputError: The name is unknown, or the file or a field cannot be used.
     """
-    if str(path_or_name) == "climb":
+    if str(path_or_name) in BUILT_IN:
         demo, _ = synthesize_climb(np.random.default_rng(_SEED))
-        return demo
+        return fit_levels(demo) if fit_floor else demo
     path = Path(path_or_name)
-    if path.suffix.lower() not in _FORMATS:
+    if path.suffix.lower() not in SUFFIXES and not path.is_file():
         raise InputError(
             f"one of the built-in demonstrations {list(BUILT_IN)} or a file "
-            f"that ends in {', '.join(_FORMATS)}",
+            f"that ends in {', '.join(SUFFIXES)}",
             source="recording",
             value=str(path_or_name),
         )
-    if path.suffix.lower() in (".yaml", ".yml"):
-        return load_recording(path, scene=scene, span=span)
-    return load_array(path, scene=scene, names=names, rate=rate, span=span)
+    return load_recording(
+        path, scene=scene, names=names, rate=rate, span=span, fit_floor=fit_floor
+    )

@@ -16,11 +16,16 @@ _FIT = 2e-3  # [m] a vertex further than this from the fitted box is no box's
 _THIN = 1e-3  # [m] what rises less above the ground is part of it
 
 
-def read_obj_boxes(path: Path, scale: float = 1.0, y_up: bool = False) -> list[Box]:
+def read_obj_boxes(path: Path, scale: float = 1.0, up: str = "z") -> list[Box]:
     """Boxes of an OBJ in the order of the file.
 
     An object (`o` or `g`) of eight vertices gives its box its name; a file without
     objects holds eight vertices a box, which are called `box1`, `box2` and so on.
+
+    Args:
+        path: The file.
+        scale: Metres per unit.
+        up: The axis that points up in it.
 
     Raises:
         InputError: It is no such file.
@@ -50,18 +55,27 @@ def read_obj_boxes(path: Path, scale: float = 1.0, y_up: bool = False) -> list[B
         count = sum(len(v) for _, v in groups)
         raise InputError("8 vertices a box", source=path, field="v", value=count)
     for name, vertices in groups:
-        v = scale * np.array(vertices)
-        if y_up:
-            v = from_y_up(v)
+        v = to_z_up(scale * np.array(vertices), up)
         for k in range(0, len(v), 8):
             single = name if name is not None and len(v) == 8 else None
             boxes.append(_fit_box(single or f"box{len(boxes) + 1}", v[k : k + 8], path))
     return boxes
 
 
-def from_y_up(x: np.ndarray) -> np.ndarray:
-    """Coordinates (..., 3) with y up as coordinates with z up."""
-    return np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)
+# Which axes, with which sign, become x, y and z: always a rotation, never a mirror.
+AXES = {
+    "z": ((0, 1), (1, 1), (2, 1)),
+    "y": ((0, 1), (2, -1), (1, 1)),
+    "x": ((1, 1), (2, 1), (0, 1)),
+    "-z": ((0, 1), (1, -1), (2, -1)),
+    "-y": ((0, 1), (2, 1), (1, -1)),
+    "-x": ((2, 1), (1, 1), (0, -1)),
+}
+
+
+def to_z_up(x: np.ndarray, up: str) -> np.ndarray:
+    """Coordinates (..., 3) in which `up` points up as coordinates with z up."""
+    return np.stack([sign * x[..., k] for k, sign in AXES[up]], axis=-1)
 
 
 def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:

@@ -10,7 +10,7 @@ Shapes: T samples, F points.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -52,6 +52,9 @@ class Demonstration:
         scene: Ground and boxes around the person, in the same world.
         subject: Segment lengths by name [m].
         gaps: Every stretch that was missing, filled or not.
+        offsets: Height of a point over what its part rests on, by kind of point, such
+            as `Knee` or `Foot.toe` [m]: the bone's and the skin's radius.
+        notes: What was recognised, assumed and corrected, for people.
     """
 
     source: str
@@ -63,6 +66,8 @@ class Demonstration:
     scene: Scene
     subject: Mapping[str, float]
     gaps: tuple[Gap, ...] = ()
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Copy the arrays, check shapes, that `t` increases and nothing is NaN."""
@@ -78,7 +83,9 @@ class Demonstration:
             raise ValueError("times must increase")
         if len(set(self.names)) != f or set(REQUIRED) - set(self.names):
             raise ValueError(f"points {self.names}, expected at least {REQUIRED}")
-        object.__setattr__(self, "subject", MappingProxyType(dict(self.subject)))
+        for name in ("subject", "offsets"):
+            proxy = MappingProxyType(dict(getattr(self, name)))
+            object.__setattr__(self, name, proxy)
 
     @property
     def rate(self) -> float:
@@ -105,6 +112,9 @@ def build_demonstration(
     synthetic: bool = False,
     t0: float = 0.0,
     max_gap: float = MAX_GAP,
+    offsets: Mapping[str, float] | None = None,
+    raised: Mapping[str, float] | None = None,
+    notes: tuple[str, ...] = (),
 ) -> Demonstration:
     """Fill short gaps, mark long ones and measure the person.
 
@@ -117,6 +127,9 @@ def build_demonstration(
         synthetic: Whether a program made it.
         t0: Time of the first sample [s].
         max_gap: Longest gap to fill by interpolation [s].
+        offsets: In place of those estimated, by kind of point [m].
+        raised: Added to those estimated, by kind of point [m].
+        notes: What was recognised and assumed on the way here.
 
     Raises:
         InputError: A needed point was never seen or the lengths are not metres.
@@ -135,7 +148,7 @@ def build_demonstration(
     subject = _measure(names, position, valid, scene)
     thigh = subject["thigh"]
     if not MIN_SEGMENT < thigh < MAX_SEGMENT:
-        hint = "unit: mm" if thigh > 50 else "unit: cm" if thigh > 1 else "unit: m"
+        hint = "unit: mm" if thigh > 100 else "unit: cm" if thigh > 1 else "unit: m"
         raise InputError(
             f"positions in metres: the thigh comes out {thigh:.4g} m long; "
             f"is {hint} meant?",
@@ -152,7 +165,48 @@ def build_demonstration(
         scene=scene,
         subject=subject,
         gaps=tuple(gaps),
+        offsets=estimate_offsets(subject, raised or {}) | dict(offsets or {}),
+        notes=(*notes, *_say_gaps(gaps)),
     )
+
+
+def _say_gaps(gaps: Sequence[Gap]) -> list[str]:
+    """How many were filled, and which were not."""
+    short = sum(g.filled for g in gaps)
+    out = [f"gaps: {short} short ones filled"] if short else []
+    long = [f"{g.point} {g.t0:.2f} to {g.t1:.2f} s" for g in gaps if not g.filled]
+    if long:
+        more = f" and {len(long) - _SHOWN} more" if len(long) > _SHOWN else ""
+        out.append(f"gaps left open: {', '.join(long[:_SHOWN])}{more}")
+    return out
+
+
+_SHOWN = 8  # gaps that a note lists
+
+
+# By kind of point: the segment whose length it goes by, and the share of it. Knuckles,
+# knees, ankles and toes are the median resting heights of one person (two recordings,
+# 40 s of standing, 6 s of kneeling); the others are the bone's radius and some skin.
+_OFFSETS = {
+    "Hand": ("forearm", 0.12),
+    "Hand.knuckle": ("forearm", 0.16),
+    "Hand.tip": ("forearm", 0.04),
+    "Hand.thumb": ("forearm", 0.08),
+    "Elbow": ("forearm", 0.20),
+    "Knee": ("thigh", 0.32),
+    "Foot": ("shank", 0.21),
+    "Foot.toe": ("shank", 0.078),
+}
+
+
+def estimate_offsets(
+    subject: Mapping[str, float], raised: Mapping[str, float]
+) -> dict[str, float]:
+    """Heights of points over what their parts rest on, by the person's size [m]."""
+    return {
+        kind: share * subject[segment] + raised.get(kind, 0.0)
+        for kind, (segment, share) in _OFFSETS.items()
+    }
 
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:

@@ -31,10 +31,12 @@ from clamber.posture.ik import (
 )
 from clamber.se3 import quat_from_matrix
 from clamber.statics import (
+    BALANCE_TOL,
     Phase,
     StaticEquilibrium,
     TorqueLimits,
     contact_angle,
+    contact_forces,
     contact_phase,
     projected_distance,
     static_equilibrium,
@@ -244,28 +246,46 @@ def bearing_frames(
 
 def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEquilibrium:
     """Static equilibrium with cones and torque limits at the present posture."""
-    w = kin.world
     names, points, normals, mu = bearing_frames(kin, contacts)
+    return static_equilibrium(
+        points,
+        normals,
+        mu,
+        kin.com.copy(),
+        kin.world.mass,
+        names=names,
+        torque=_torque_limits(kin, names, points),
+    )
+
+
+def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
+    """Whether forces within cones and torque limits hold the present posture.
+
+    What `equilibrium_at` says without a margin, at a hundredth of the cost.
+    """
+    names, points, normals, mu = bearing_frames(kin, contacts)
+    torque = _torque_limits(kin, names, points)
+    com, mass = kin.com.copy(), kin.world.mass
+    found = contact_forces(points, normals, mu, com, mass, torque=torque)
+    return found.residual <= BALANCE_TOL
+
+
+def _torque_limits(
+    kin: Kinematics, names: Sequence[str], points: np.ndarray
+) -> TorqueLimits:
+    w = kin.world
     J = np.concatenate(
         [
             kin.point_jacobian(w.surfaces[n].body, p).copy()
             for n, p in zip(names, points, strict=True)
         ]
     )
-    return static_equilibrium(
-        points,
-        normals,
-        mu,
-        kin.com.copy(),
-        w.mass,
-        names=names,
-        torque=TorqueLimits(
-            jacobian=J,
-            gravity=kin.gravity(),
-            dofs=w.dadr,
-            limits=w.tau_max,
-            names=w.joints,
-        ),
+    return TorqueLimits(
+        jacobian=J,
+        gravity=kin.gravity(),
+        dofs=w.dadr,
+        limits=w.tau_max,
+        names=w.joints,
     )
 
 
