@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from typing import ClassVar
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -484,13 +485,47 @@ def test_forces_and_postures_are_smoothed_with_their_time_constants(pilot):
     assert np.allclose(pilot._pose, target)
 
 
-def test_both_quaternions_of_a_rotation_are_the_same_posture(pilot):
-    q = pilot._pose.copy()
-    mirrored = q.copy()
-    mirrored[3:7] *= -1
-    for k in range(50):
-        pilot._sense(Measurement(mirrored if k % 2 else q, pilot._load))
-        assert abs(pilot._pose[3:7] @ q[3:7]) == pytest.approx(1.0, abs=1e-12)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_both_quaternions_of_a_rotation_are_the_same_posture(pilot, sign):
+    target = pilot._pose.copy()
+    target[3:7] = [np.cos(0.1), 0.0, np.sin(0.1), 0.0]
+    there = target.copy()
+    there[3:7] *= sign
+    for _ in range(200):
+        pilot._sense(Measurement(there, pilot._load))
+    assert abs(pilot._pose[3:7] @ target[3:7]) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_posture_to_plan_from_has_joints_as_commanded_and_base_as_measured(pilot):
+    pilot._pose = pilot.reference + 0.01
+    q = pilot._rebased()
+    assert np.array_equal(q[:7], pilot._pose[:7])
+    assert np.array_equal(q[7:], pilot.reference[7:])
+
+
+def test_what_is_believed_begins_where_the_robot_began(pilot):
+    start = np.array([0.03, -0.02, 0.1])
+    scene = replace(pilot._world.scene, start=start)
+    pilot._world = replace(pilot._world, scene=scene)
+    assert np.array_equal(pilot._believed().start, start)
+
+
+def test_a_contact_that_has_rolled_is_where_it_was_planned(pilot, hands_plan):
+    """The ball turns with its link about a horizontal axis and moves by r theta."""
+    c = placed(pilot, hands_plan, 1)
+    radius = hands_plan.world.surfaces["LHand"].radius
+    theta = 0.3
+    turn = np.array([np.cos(theta / 2), 0.0, np.sin(theta / 2), 0.0])
+    kin = Kinematics(hands_plan.world)
+    kin.update(pilot._pose)
+    up = np.array([0.0, 0.0, 1.0])
+    before = kin.contact_point("LHand", up)
+    q = pilot._pose
+    mujoco.mju_mulQuat(q[3:7], turn, q[3:7].copy())
+    kin.update(q)
+    q[:3] += before + radius * theta * np.eye(3)[0] - kin.contact_point("LHand", up)
+    assert radius * theta > 5e-3
+    assert pilot._off(c) == pytest.approx((0.0, 0.0), abs=1.5e-3)
 
 
 def placed(pilot, plan, keyframe: int, up: float = 0.0, side: float = 0.0):
