@@ -970,3 +970,17 @@ def test_a_contact_that_bears_nothing_is_felt_for_again(fast_plan, found):
     assert low == pytest.approx(0.5 * DEVIATION if found else REACH, abs=2e-3)
     assert (pilot._i > leg.end) == found
     assert pilot.stopped == ""
+    if found:
+        return
+    # The hand is no part of the stance any more, nor of what is believed of the box.
+    while len(pilot.events) == 2 and pilot._k < 20_000:
+        force = scales(pilot)
+        force[hand] = 0.0
+        pilot.command(Measurement(pilot.reference.copy(), force))
+    assert pilot.stopped or "planned again" in pilot.events[2].text
+    assert "LHand" not in {c.surface for c in pilot._keyframes[pilot._leg].stance} or (
+        pilot.stopped
+    )
+    believed = pilot._believed().boxes[0].top
+    assert abs(float(top.height(believed.position))) < 3e-3
+    assert float(top.normal @ believed.normal) > np.cos(0.02)
