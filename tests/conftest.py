@@ -109,6 +109,39 @@ def fast_plan(demo_plan):
 
 
 @pytest.fixture(scope="session")
+def hands_plan(demo_plan):
+    """Fast, and no more than the first two steps: both hands on the box."""
+    from dataclasses import replace
+
+    from clamber.trajectory import build_trajectory
+
+    paths, stances = demo_plan.paths[:2], demo_plan.sequence.stances
+    down = [
+        i
+        for i, stance in enumerate(stances)
+        if {"LHand", "RHand"} <= set(stance.surfaces)
+    ]
+    trajectory = build_trajectory(
+        demo_plan.world,
+        [p for path in paths for p in path.phases],
+        speed="max",
+        keyframe_after=(np.cumsum([len(path.phases) for path in paths]) - 1).tolist(),
+    )
+    return replace(
+        demo_plan,
+        options=replace(demo_plan.options, speed="max"),
+        sequence=replace(
+            demo_plan.sequence,
+            stances=stances[: down[0] + 1],
+            t=demo_plan.sequence.t[: down[0] + 2],
+        ),
+        keyframes=demo_plan.keyframes[:3],
+        paths=paths,
+        trajectory=trajectory,
+    )
+
+
+@pytest.fixture(scope="session")
 def demo_rollout(demo_plan):
     """Open loop, by sensors that know everything."""
     from clamber.disturbance import Disturbance

@@ -266,6 +266,7 @@ def test_a_contact_that_does_not_bear_yet_is_loaded_little_by_little(demo_plan):
     tau = holding_torque(kin, found.keyframes[0].q, key.stance)
     assert np.allclose(t.tau[settled], tau, atol=1e-4)
     assert np.abs(tau - holding_torque(kin, found.keyframes[0].q, loaded)).max() > 0.1
+    assert np.abs(np.diff(t.tau[: settled + 1], axis=0)).max() < 0.2  # no jump
     # The contact is closed all the while.
     assert t.contact[: settled + 1, t.surfaces.index("RHand")].all()
 

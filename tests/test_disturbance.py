@@ -54,9 +54,18 @@ def test_beyond_a_bound_the_error_names_field_value_and_range(name, side):
     lo, hi = LIMITS[name]
     assert caught.value.field == f"disturb.{name}"
     assert caught.value.value == value
+    kind = "a whole number" if name == "seed" else "a number"
     assert str(caught.value) == (
-        f"disturb.{name} is {value!r}; expected a number from {lo:g} to {hi:g}"
+        f"disturb.{name} is {value!r}; expected {kind} from {lo:g} to {hi:g}"
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("mass", None), ("mass", "heavy"), ("seed", 1.5), ("yaw", [0])]
+)
+def test_what_is_no_such_number_is_refused(name, value):
+    with pytest.raises(InputError, match=rf"disturb\.{name} .*number from"):
+        Disturbance(**{name: value})
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -331,3 +331,9 @@ def test_a_goal_with_a_heading_wants_that_heading(
     there = replace(world, scene=replace(world.scene, goal=goal))
     names = failed(replace(demo_plan, world=there), with_last(demo_rollout, q))
     assert ("yaw to the goal [rad]" in names) == (abs(share) > 1)
+
+
+def test_a_box_that_is_not_there_is_no_crash_of_the_judge(start_only):
+    nothing = Scene(start=np.zeros(3))
+    rollout = simulate(start_only, controller="pid", truth=nothing)
+    assert not judge(start_only, rollout).reached

@@ -142,6 +142,27 @@ def test_boxes_are_higher_and_stay_on_the_ground(world, scene, height):
         assert np.allclose(top.position - b.top.position, rise, atol=1e-12)
 
 
+@pytest.mark.parametrize("turn", [(np.pi / 2, 0, 0), (0, np.pi / 2, 0), (np.pi, 0, 0)])
+def test_a_box_on_its_side_is_disturbed_as_it_lies(scene, turn):
+    """The same body, described by axes that lie otherwise: the same top."""
+    upright = scene.boxes[0]
+    R = matrix_from_rpy(turn)
+    lying = replace(
+        upright,
+        size=np.abs(R.T @ upright.size),
+        rotation=upright.rotation @ R,
+    )
+    d = Disturbance(height=0.04)
+
+    def corners(box: Box) -> np.ndarray:
+        higher = disturbed_scene(replace(scene, boxes=(box,)), d).boxes[0]
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        points = higher.position + 0.5 * signs * higher.size @ higher.rotation.T
+        return points[np.lexsort(points.round(6).T)]
+
+    assert np.allclose(corners(lying), corners(upright), atol=1e-9)
+
+
 @pytest.mark.parametrize("pitch", [0.2, -0.2])
 def test_a_pitch_sinks_the_far_end_and_leaves_the_near_edge(world, scene, pitch):
     there = disturbed_world(world, Disturbance(pitch=pitch))

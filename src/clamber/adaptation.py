@@ -21,10 +21,11 @@ from clamber.path import ARC_WEIGHT, Phase, bridge
 from clamber.pipeline import Plan, search_steps
 from clamber.posture import direct
 from clamber.posture.ik import IK, ContactGoal, support_rotation
-from clamber.posture.keyframe import Keyframe, KeyframeTask
+from clamber.posture.keyframe import Keyframe, KeyframeTask, bearing_frames
 from clamber.scaling import retarget
 from clamber.scene import Scene
 from clamber.search import standing
+from clamber.statics import com_margin, support_polygon
 from clamber.trajectory import HOLD_END, HOLD_START, RATE, Trajectory, build_trajectory
 from clamber.transition import balance_problem
 
@@ -186,7 +187,8 @@ def feeling(
         q: (nq,) reference to begin from.
 
     Returns:
-        As far as can be reached, at most `REACH`; None where that is nowhere.
+        As far as can be reached, at most `REACH`; None where that is nowhere, or the
+        others do not balance the robot alone.
     """
     lower = tuple(
         replace(b, position=b.position - REACH * b.top.normal)
@@ -196,6 +198,10 @@ def feeling(
     )
     world = build_world(world.robot, replace(world.scene, boxes=lower))
     ik = IK(world)
+    ik.kin.update(q)
+    points = bearing_frames(ik.kin, held)[1][:, :2]
+    if com_margin(ik.kin.com[:2], support_polygon(points)) <= 0:
+        return None
     support = world.supports[contact.support]
     nodes, depths = [q], [0.0]
     for depth in np.linspace(0.0, REACH, FEELING_NODES)[1:].tolist():

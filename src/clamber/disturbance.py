@@ -66,12 +66,13 @@ class Disturbance:
         """
         for f in fields(self):
             value = getattr(self, f.name)
-            if value is None:
+            if value is None and f.name == "friction":
                 continue
             lo, hi = LIMITS[f.name]
-            if not lo <= value <= hi:
+            kind, word = (int, "whole ") if f.name == "seed" else ((int, float), "")
+            if not isinstance(value, kind) or not lo <= value <= hi:
                 raise InputError(
-                    f"a number from {lo:g} to {hi:g}",
+                    f"a {word}number from {lo:g} to {hi:g}",
                     field=f"disturb.{f.name}",
                     value=value,
                 )

@@ -216,7 +216,8 @@ class Execution:
         yield from self._play(leg.end)
         self._leg += 1
         self._tick_off(leg)
-        self._remember(self._keyframes[self._leg].stance)
+        stance = self._keyframes[self._leg].stance
+        self._remember([c for c in stance if self._force(c) >= LOST])
         yield from self._check_stance()
 
     def _take(self, made: Contact) -> Ticks:
@@ -269,7 +270,10 @@ class Execution:
             felt = yield from self._feel(c)
             if felt is None:
                 self._note(f"{c.surface} finds nothing: the others bear the robot")
-            elif felt is not c or abs(self._off(c)[0]) > DEVIATION:
+                others = [x for x in stance if x is not c]
+                yield from self._replan(others, others)
+                return
+            if felt is not c or abs(self._off(c)[0]) > DEVIATION:
                 others = [x for x in stance if x is not c]
                 yield from self._replan((*others, felt), others)
                 return
@@ -361,6 +365,8 @@ class Execution:
         """Take the stance as it is and plan the remaining steps again."""
         yield from self._rest(LOOK)
         off = max(max(abs(u), s) for u, s in (self._off(c) for c in contacts))
+        if len(contacts) < len(self._keyframes[self._leg].stance):
+            off = np.inf  # without a contact there is no going on as planned
         bearing = [c in loaded for c in contacts]
         felt = [self._as_felt(c) for c in contacts]
         self._remember(felt)

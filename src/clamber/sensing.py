@@ -55,7 +55,7 @@ class Sensors:
         self._model = m
         self._noise, self._rng = noise, rng
         self._qadr = world.qadr
-        self._row = np.full(m.ngeom, -1)
+        self._row = np.where(m.body_weldid[m.geom_bodyid] == 0, -1, -2)
         for i, s in enumerate(world.surfaces):
             self._row[list(world.surfaces[s].geoms)] = i
         self._surfaces = len(world.surfaces)
@@ -110,7 +110,8 @@ def surface_forces(
 
     Args:
         data: After a step.
-        row_of_geom: (ngeom,) index of the surface that a geom belongs to, or -1.
+        row_of_geom: (ngeom,) index of the surface that a geom belongs to; -1 for the
+            environment, -2 for other parts of the robot.
         surfaces: Their number.
     """
     out = np.zeros((surfaces, 3))
@@ -119,8 +120,8 @@ def surface_forces(
     c = data.contact
     address = c.efc_address
     rows = row_of_geom[c.geom]
-    # One of the two is the robot's surface, the other bears none.
-    use = (address >= 0) & ((rows[:, 0] < 0) != (rows[:, 1] < 0))
+    one, other = rows.max(axis=1), rows.min(axis=1)
+    use = (address >= 0) & (one >= 0) & (other == -1)
     if not use.any():
         return out
     address = address[use]

@@ -318,7 +318,8 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     on_boxes = sum(rollout.end_share.values()) - on_ground
     up, up_planned = (_up(q[3:7]) for q in (last, planned))
     tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
-    tops = [rollout.world.supports[c.support].position[2] for c in final]
+    supports = rollout.world.supports
+    tops = [supports[c.support].position[2] for c in final if c.support in supports]
     order = [world.model.actuator(j).id for j in world.joints]
     share = np.abs(rollout.actuator_force[:, order]) / rollout.world.tau_max
     effort = float(share.max(initial=0.0))

@@ -65,7 +65,7 @@ def disturbed_world(
 def disturbed_scene(scene: Scene, d: Disturbance) -> Scene:
     """The scene with other heights, tilts, friction and start; tiles aside."""
     boxes = []
-    for b in scene.boxes:
+    for b in map(_upright, scene.boxes):
         size = b.size + np.array([0.0, 0.0, d.height])
         if size[2] <= 0.01:
             raise InputError(
@@ -94,6 +94,14 @@ def disturbed_scene(scene: Scene, d: Disturbance) -> Scene:
         ground_friction=scene.ground_friction if d.friction is None else d.friction,
         start=np.array([x + d.x, y + d.y, yaw + d.yaw]),
     )
+
+
+def _upright(box: Box) -> Box:
+    """The same box with its own z axis up, as near as can be."""
+    top = box.top
+    up = int(np.argmax(np.abs(box.rotation.T @ top.normal)))
+    size = box.size[[(up + 1) % 3, (up + 2) % 3, up]]
+    return replace(box, rotation=top.rotation, size=size)
 
 
 def _tile(
