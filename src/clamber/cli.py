@@ -406,7 +406,9 @@ class ExportCommand:
     """Largest joint speed on the way from there to the first posture."""
     layout: Annotated[
         Literal["mjlab", "holosoma"] | None,
-        tyro.conf.arg(help_behavior_hint="(default: mjlab; npz alone)"),
+        tyro.conf.arg(
+            metavar="mjlab|holosoma", help_behavior_hint="(default: mjlab; npz alone)"
+        ),
     ] = None
     """Whose joint_pos and joint_vel an npz holds."""
     out: Annotated[
