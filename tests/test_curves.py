@@ -275,7 +275,10 @@ def test_the_page_of_experiments_tells_what_has_been_run(tmp_path: Path):
     assert "So far 200 of 300 runs." in text
     assert "| mixed | 200 | 200 | 100.0 % | 98.1 to 100.0 % |" in text
     pictures = {f.name for f in (docs / "experiments").iterdir()}
-    assert pictures == {"friction.png", "all-at-once.png"}
+    names = {"friction", "all-at-once"}
+    assert pictures == {f"{n}.{kind}" for n in names for kind in ("png", "csv")}
+    kept = (docs / "experiments" / "friction.csv").read_text()
+    assert kept == (runs / "friction" / "runs.csv").read_text()
 
 
 def test_every_experiment_has_its_place_on_the_page():

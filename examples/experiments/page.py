@@ -1,8 +1,9 @@
 """The experiments as a page of the documentation: python page.py RUNS DOCS.
 
 Reads the sweeps `RUNS/<name of the spec>` of all specs beside this file and writes
-`DOCS/experiments.md` with a table of each, and the pictures in `DOCS/experiments`. A
-sweep that is not done yet is shown as far as it is; one that has not begun is left out.
+`DOCS/experiments.md` with a table of each; pictures and all rows are in
+`DOCS/experiments`. A sweep that is not done yet is shown as far as it is; one that has not
+begun is left out.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ def page(runs: Path, pictures: Path) -> str:
         spec, rows = load_sweep(folder)
         wanted = sum(s.runs for s in strands(spec))
         draw_success(spec, rows, pictures / f"{name}.png")
+        shutil.copyfile(folder / "runs.csv", pictures / f"{name}.csv")
         comment = [
             line.removeprefix("# ")
             for line in (HERE / f"{name}.yaml").read_text().splitlines()
@@ -52,6 +54,7 @@ def page(runs: Path, pictures: Path) -> str:
             parts.append(f"So far {len(rows)} of {wanted} runs.\n")
         parts.append(table(summarise(spec, rows), search=spec.search is not None))
         parts.append(f"![{spec.about}](experiments/{name}.png)\n")
+        parts.append(f"[Every run, with its command](experiments/{name}.csv)\n")
     return "\n".join(parts)
 
 
