@@ -2,8 +2,8 @@
 
 Reads the sweeps `RUNS/<name of the spec>` of all specs beside this file and writes
 `DOCS/experiments.md` with a table of each; pictures and all rows are in
-`DOCS/experiments`. A sweep that is not done yet is shown as far as it is; one that has not
-begun is left out.
+`DOCS/experiments`. A sweep that is not done yet is shown as far as it is; one that has
+not begun is left out.
 """
 
 from __future__ import annotations
