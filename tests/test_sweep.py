@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import csv
+import functools
 import hashlib
 import json
 import os
@@ -102,6 +103,8 @@ def start(spec_file: Path, out: Path) -> subprocess.Popen[str]:
         text=True,
         env={**os.environ, sweep_jobs.SECONDS: "0.15"},
         start_new_session=True,
+        # Whatever starts the tests in the background has interrupts ignored.
+        preexec_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
 
 
