@@ -20,9 +20,11 @@ from clamber.experiment import load_spec as load_spec
 from clamber.export import Exported as Exported
 from clamber.export import export_run as export_run
 from clamber.io import load_plan as load_plan
+from clamber.io import load_policy as load_policy
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
+from clamber.io import save_policy as save_policy
 from clamber.io import save_rollout as save_rollout
 from clamber.io import save_sequence as save_sequence
 from clamber.io import save_verdict as save_verdict
@@ -38,6 +40,11 @@ from clamber.model import load_robot as load_robot
 from clamber.pipeline import Plan as Plan
 from clamber.pipeline import PlanOptions as PlanOptions
 from clamber.pipeline import plan as plan
+from clamber.policy import DemoPolicy as DemoPolicy
+from clamber.policy import GeneralPolicy as GeneralPolicy
+from clamber.policy import Option as Option
+from clamber.policy import PelvisDistribution as PelvisDistribution
+from clamber.policy import pelvis_distribution as pelvis_distribution
 from clamber.scene import Box as Box
 from clamber.scene import Scene as Scene
 from clamber.scene import Support as Support

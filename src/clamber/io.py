@@ -18,7 +18,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import IO, Any, TypeVar, get_args, get_type_hints
@@ -29,11 +29,18 @@ import numpy as np
 import pydantic
 
 import clamber.model
-from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.contact import (
+    Contact,
+    ContactInterval,
+    ContactSequence,
+    Region,
+    Stance,
+)
 from clamber.errors import InputError, Status
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
 from clamber.pipeline import Plan, PlanOptions, Skipped
+from clamber.policy import DemoPolicy, GeneralPolicy, Option, PelvisDistribution, Place
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
 from clamber.scene import Box, Scene, input_error
@@ -44,6 +51,7 @@ from clamber.trajectory import Trajectory
 
 VERSION = 1
 SEQUENCE = "sequence.json"
+POLICY = "policy.json"
 PLAN = "plan.json"
 TRAJECTORY = "trajectory.npz"
 SCENE = "scene.xml"
@@ -79,6 +87,7 @@ _Record = TypeVar("_Record")
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Pose = tuple[float, float, float, float, float, float, float]
 
 
 # Folders and whole files.
@@ -358,11 +367,22 @@ def contact_fields(c: Contact) -> dict[str, Any]:
     }
 
 
-class _StanceFile(pydantic.BaseModel):
-    t0: float
-    t1: float
+class _StateOfFile(pydantic.BaseModel):
     contacts: list[_ContactFile]
     posture: dict[str, Vector] = {}
+    pelvis: Pose | None = None
+
+    def stance(self) -> Stance:
+        return Stance(
+            contacts=tuple(c.contact() for c in self.contacts),
+            posture={n: np.array(v) for n, v in self.posture.items()},
+            pelvis=None if self.pelvis is None else np.array(self.pelvis),
+        )
+
+
+class _StanceFile(_StateOfFile):
+    t0: float
+    t1: float
 
 
 class _IntervalFile(_ContactFile):
@@ -393,13 +413,7 @@ class _SequenceFile(pydantic.BaseModel):
                 source=self.source,
                 subject=self.subject,
                 scene=self.scene.scene(),
-                stances=tuple(
-                    Stance(
-                        contacts=tuple(c.contact() for c in s.contacts),
-                        posture={n: np.array(v) for n, v in s.posture.items()},
-                    )
-                    for s in self.stances
-                ),
+                stances=tuple(s.stance() for s in self.stances),
                 t=np.array([s.t0 for s in self.stances] + [self.stances[-1].t1]),
                 intervals=tuple(
                     ContactInterval(
@@ -418,6 +432,15 @@ class _SequenceFile(pydantic.BaseModel):
             ) from e
 
 
+def _stance_fields(stance: Stance) -> dict[str, Any]:
+    """Contacts and posture of a stance; its pelvis where it has one."""
+    out: dict[str, Any] = {
+        "contacts": [contact_fields(c) for c in stance.contacts],
+        "posture": stance.posture,
+    }
+    return out if stance.pelvis is None else out | {"pelvis": stance.pelvis}
+
+
 def sequence_fields(sequence: ContactSequence) -> dict[str, Any]:
     """A contact sequence by the keys of `sequence.json`."""
     return {
@@ -425,13 +448,8 @@ def sequence_fields(sequence: ContactSequence) -> dict[str, Any]:
         "subject": sequence.subject,
         "scene": scene_fields(sequence.scene),
         "stances": [
-            {
-                "region": s.region,
-                "t0": sequence.t[i],
-                "t1": sequence.t[i + 1],
-                "contacts": [contact_fields(c) for c in s.contacts],
-                "posture": s.posture,
-            }
+            {"region": s.region, "t0": sequence.t[i], "t1": sequence.t[i + 1]}
+            | _stance_fields(s)
             for i, s in enumerate(sequence.stances)
         ],
         "intervals": [
@@ -462,6 +480,135 @@ def load_sequence(path: str | Path) -> ContactSequence:
     if file.is_dir():
         file = file / SEQUENCE
     return _read_json(file, _SequenceFile).sequence(file)
+
+
+# Policies.
+
+
+class _OptionFile(pydantic.BaseModel):
+    name: str
+    region: Place
+    surfaces: tuple[str, ...]
+    repeats: int
+    initiation: tuple[Region, ...]
+    held: tuple[str, ...]
+    termination: Place
+
+
+class _PelvisFile(pydantic.BaseModel):
+    mean: Vector
+    sigma: tuple[float | None, float | None, float | None]
+    samples: int
+
+    def distribution(self) -> PelvisDistribution:
+        sigma = [math.inf if s is None else s for s in self.sigma]
+        return PelvisDistribution(
+            mean=np.array(self.mean), sigma=np.array(sigma), samples=self.samples
+        )
+
+
+class _DemoFile(pydantic.BaseModel):
+    source: str
+    scene: _SceneFile
+    subject: dict[str, float]
+    states: list[_StateOfFile]
+    actions: tuple[str, ...]
+
+    def demo(self) -> DemoPolicy:
+        return DemoPolicy(
+            source=self.source,
+            scene=self.scene.scene(),
+            subject=self.subject,
+            states=tuple(s.stance() for s in self.states),
+            actions=self.actions,
+        )
+
+
+class _GeneralFile(pydantic.BaseModel):
+    options: list[_OptionFile]
+    over_top: _PelvisFile
+    near_edge: _PelvisFile
+    goal: tuple[str, ...]
+    reach: dict[str, float]
+    demos: list[_DemoFile]
+    notes: tuple[str, ...] = ()
+    secondary: list[_GeneralFile] = []
+
+    def policy(self, path: Path, field: str) -> GeneralPolicy:
+        """The record; what does not fit is named by its field of the file."""
+
+        def made(where: str, make: Callable[[], _Record]) -> _Record:
+            try:
+                return make()
+            except (ValueError, KeyError) as e:
+                text = f"a policy that fits together ({e.args[0]})"
+                raise InputError(text, source=path, field=f"{field}{where}") from e
+
+        return made(
+            "options",
+            lambda: GeneralPolicy(
+                options=tuple(
+                    made(f"options.{i}", lambda o=o: Option(**o.model_dump()))
+                    for i, o in enumerate(self.options)
+                ),
+                over_top=made("over_top", self.over_top.distribution),
+                near_edge=made("near_edge", self.near_edge.distribution),
+                goal=self.goal,
+                reach=self.reach,
+                demos=tuple(
+                    made(f"demos.{i}", d.demo) for i, d in enumerate(self.demos)
+                ),
+                notes=self.notes,
+                secondary=tuple(
+                    s.policy(path, f"{field}secondary.{i}.")
+                    for i, s in enumerate(self.secondary)
+                ),
+            ),
+        )
+
+
+def policy_fields(policy: GeneralPolicy) -> dict[str, Any]:
+    """A general policy by the keys of `policy.json`."""
+    return {
+        "options": [asdict(o) for o in policy.options],
+        "over_top": _pelvis_fields(policy.over_top),
+        "near_edge": _pelvis_fields(policy.near_edge),
+        "goal": policy.goal,
+        "reach": policy.reach,
+        "notes": policy.notes,
+        "demos": [
+            {
+                "source": d.source,
+                "scene": scene_fields(d.scene),
+                "subject": d.subject,
+                "states": [{"region": s.region} | _stance_fields(s) for s in d.states],
+                "actions": d.actions,
+            }
+            for d in policy.demos
+        ],
+        "secondary": [policy_fields(s) for s in policy.secondary],
+    }
+
+
+def _pelvis_fields(d: PelvisDistribution) -> dict[str, Any]:
+    return {"mean": d.mean, "sigma": d.sigma, "samples": d.samples}
+
+
+def save_policy(policy: GeneralPolicy, path: str | Path) -> None:
+    """Write `policy.json`: the general policy and the demo policies behind it."""
+    _write_json(Path(path), policy_fields(policy))
+
+
+def load_policy(path: str | Path) -> GeneralPolicy:
+    """Read a `policy.json`, or that of a folder.
+
+    Raises:
+        InputError: The file or one of its fields cannot be used.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / POLICY
+    return _read_json(file, _GeneralFile).policy(file, "")
 
 
 # Plans.
