@@ -231,7 +231,7 @@ class ClimbCommand:
     """The whole job: detect contacts, plan, simulate; all files in one run folder."""
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
-    """A recording, or the built-in demonstration (climb)."""
+    """A recording, or a built-in demonstration (climb, crossing)."""
     fit_floor: bool = False
     """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
