@@ -47,6 +47,7 @@ LAYERS = [
     "simulation",
     "alternatives",
     "policy",
+    "contraction",
     "job",
     "success",
     "experiment",

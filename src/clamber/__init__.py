@@ -47,6 +47,7 @@ _HOME = {
     "detect_contacts": "detect",
     "export_run": "export",
     "judge": "simulation",
+    "learn_policy": "contraction",
     "limb_lengths": "model",
     "load_demo": "demo",
     "load_plan": "io",

@@ -2,6 +2,7 @@ from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
 from clamber.contact import Stance as Stance
+from clamber.contraction import learn_policy as learn_policy
 from clamber.curves import save_curves as save_curves
 from clamber.demo import Demonstration as Demonstration
 from clamber.demo import load_demo as load_demo

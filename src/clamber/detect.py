@@ -606,18 +606,52 @@ def _stances(
         held.append(now)
     times.append(cuts[-1])
     stances = tuple(
-        Stance(contacts=contacts, posture=_posture(tracks, a, b))
+        Stance(
+            contacts=contacts,
+            posture=_posture(tracks, a, b),
+            pelvis=_pelvis(tracks, a, b),
+        )
         for contacts, a, b in zip(held, times[:-1], times[1:], strict=True)
     )
     return np.array(times), stances
 
 
-def _posture(tracks: _Tracks, t0: float, t1: float) -> dict[str, np.ndarray]:
-    """Mean directions of the segments over the middle half of a stance."""
+def _middle(tracks: _Tracks, t0: float, t1: float) -> np.ndarray:
+    """(T,) the middle half of a stance, one sample at least."""
     quarter = (t1 - t0) / 4.0
     t = tracks.demo.t
     middle = (t >= t0 + quarter) & (t <= t1 - quarter)
     middle[np.argmin(np.abs(t - (t0 + t1) / 2.0))] = True
+    return middle
+
+
+def _pelvis(tracks: _Tracks, t0: float, t1: float) -> np.ndarray | None:
+    """Mean pose (7,) of the pelvis over the middle half of a stance, where seen.
+
+    Between the hips, y to the left one, z along the trunk as far as it is square to y:
+    markers on hips and shoulders tell no more.
+    """
+    names = ("LHip", "RHip", "LShoulder", "RShoulder")
+    ok = _middle(tracks, t0, t1) & tracks.valid(*names)
+    if not ok.any():
+        return None
+    hips, shoulders = (
+        [np.mean(tracks.at(n)[ok], axis=0) for n in pair]
+        for pair in (names[:2], names[2:])
+    )
+    y = hips[0] - hips[1]
+    y = y / np.linalg.norm(y)
+    position = np.mean(hips, axis=0)
+    z = np.mean(shoulders, axis=0) - position
+    z = z - y * (y @ z)
+    z = z / np.linalg.norm(z)
+    R = np.stack([np.cross(y, z), y, z], axis=1)
+    return np.concatenate([position, quat_from_matrix(R)])
+
+
+def _posture(tracks: _Tracks, t0: float, t1: float) -> dict[str, np.ndarray]:
+    """Mean directions of the segments over the middle half of a stance."""
+    middle = _middle(tracks, t0, t1)
     segments: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         "trunk": (("LHip", "RHip"), ("LShoulder", "RShoulder"))
     }

@@ -512,7 +512,7 @@ class _DemoFile(pydantic.BaseModel):
     scene: _SceneFile
     subject: dict[str, float]
     states: list[_StateOfFile]
-    actions: tuple[str, ...]
+    actions: tuple[str | None, ...]
 
     def demo(self) -> DemoPolicy:
         return DemoPolicy(
