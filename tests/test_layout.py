@@ -56,6 +56,7 @@ LAYERS = [
     "export",
     "viz",
     "curves",
+    "policy_plots",
     "view",
     "report",
     "",  # the package itself: its public names

@@ -367,6 +367,100 @@ class SimulateCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LearnCommand:
+    """Learn the general policy of demonstrations: policy.json and its pictures."""
+
+    demonstrations: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="RECORDING|SEQUENCE|NAME"),
+    ]
+    """Recordings, sequence.json files, or built-in demonstrations (crossing)."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE", help_behavior_hint="(default: runs/learn/policy.json)"
+        ),
+    ] = None
+    """The policy's file; pictures are written beside it."""
+    output: Printed
+
+    def run(self) -> int:
+        """Demonstrations to a policy."""
+        from clamber.io import POLICY, policy_summary
+        from clamber.policy_plots import save_pictures
+
+        if not self.demonstrations:
+            raise InputError("at least one demonstration, such as crossing")
+        if self.out is not None and self.out.suffix != ".json":
+            raise InputError(
+                "a file that ends in .json", source="--out", value=str(self.out)
+            )
+        with self.output.progress() as report:
+            sequences = []
+            for k, name in enumerate(self.demonstrations):
+                report("detect", k / len(self.demonstrations), name)
+                sequences.append(_sequence(name))
+            report("detect", 1.0, "")
+            policy = clamber.learn_policy(sequences)
+            folder = clamber.new_run_folder(self.out and self.out.parent, "learn")
+            file = self.out or folder / POLICY
+            clamber.save_policy(policy, file)
+            report("draw", 0.0, "")
+            pictures = save_pictures(policy, file)
+            report("draw", 1.0, "")
+        record = {
+            "out": str(file),
+            "pictures": [str(p) for p in pictures],
+            **policy_summary(policy),
+        }
+        tables, notes = [], [*policy.notes]
+        for k, one in enumerate((policy, *policy.secondary)):
+            tables += _policy_tables(one, f"secondary {k}" if k else "")
+            notes += one.notes if k else ()
+            if k:
+                notes.append(f"secondary {k}: {', '.join(one.sources)}")
+        note = "\n".join([*notes, f"the policy is in {file}"])
+        self.output.show(record, *tables, note=note)
+        return REACHED
+
+
+def _sequence(name: str) -> clamber.ContactSequence:
+    """The contact sequence of a file, or what is detected in a recording."""
+    path = Path(name)
+    if path.suffix == ".json" or path.is_dir():
+        return clamber.load_sequence(path)
+    return clamber.detect_contacts(clamber.load_demo(name))
+
+
+def _policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
+    """Options, and how the pelvis is held."""
+    options = _table(
+        " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
+        "until",
+    )  # fmt: skip
+    for o in policy.options:
+        options.add_row(
+            o.name, o.region, ", ".join(o.surfaces), str(o.repeats),
+            " ".join(o.initiation), o.termination,
+        )  # fmt: skip
+    pelvis = _table("pelvis", "angle", "mean [deg]", "sigma [deg]", "imposed [deg]")
+    for place, d in (("near edge", policy.near_edge), ("over top", policy.over_top)):
+        for k, angle in enumerate(("roll", "pitch", "yaw")):
+            imposed = d.imposed[k]
+            pelvis.add_row(
+                "" if k else f"{place} ({d.samples})",
+                angle,
+                f"{math.degrees(d.mean[k]):.1f}",
+                f"{math.degrees(d.sigma[k]):.1f}",
+                "-"
+                if imposed is None
+                else " to ".join(f"{math.degrees(x):.1f}" for x in imposed),
+            )
+    return [options, pelvis]
+
+
+@dataclass(frozen=True, kw_only=True)
 class RenderCommand:
     """Draw pictures and a video of a run."""
 
@@ -588,6 +682,7 @@ Command = (
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]

@@ -12,7 +12,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from statistics import median
 
 import numpy as np
@@ -180,28 +179,47 @@ class _Cycle:
         return self.place, frozenset(self.surfaces)
 
 
-def _dominant(demo: DemoPolicy) -> list[_Action]:
-    """Actions of the surfaces that bear their limbs.
+def dominant_actions(demo: DemoPolicy) -> list[int]:
+    """Indices of the actions whose surfaces bear their limbs.
 
     A hand set down while its elbow bears, or just before its elbow is set down again,
-    is none.
+    bears nothing.
     """
-    rows = [
-        (action, before, after)
-        for action, (before, after) in zip(
-            demo.actions, pairwise(demo.states), strict=True
-        )
-        if action is not None
-    ]
-    following = [*(action for action, _, _ in rows[1:]), None]
+    making = [i for i, action in enumerate(demo.actions) if action is not None]
     out = []
-    for (surface, before, after), comes in zip(rows, following, strict=True):
-        inner = _INNER.get(surface, "")
-        lands = comes == inner and before.contact(inner) is not None
-        makes = after.contact(surface)
-        if not lands and makes is not None and after.contact(inner) is None:
-            out.append(_Action(taken=before, makes=makes, leads=after.region))
+    for i, following in zip(making, [*making[1:], None], strict=True):
+        before, after = demo.states[i : i + 2]
+        inner = _INNER.get(str(demo.actions[i]), "")
+        lands = (
+            following is not None
+            and demo.actions[following] == inner
+            and before.contact(inner) is not None
+        )
+        if not lands and after.contact(inner) is None:
+            out.append(i)
     return out
+
+
+def _dominant(demo: DemoPolicy) -> list[_Action]:
+    """Those actions; where a hand lands before its elbow, taken before the hand's."""
+    ruling = dominant_actions(demo)
+    out = []
+    for i in ruling:
+        surface, began = str(demo.actions[i]), i
+        while (
+            began and began - 1 not in ruling and _same_limb(demo, began - 1, surface)
+        ):
+            began -= 1
+        after = demo.states[i + 1]
+        makes = after.contact(surface)
+        assert makes is not None
+        out.append(_Action(taken=demo.states[began], makes=makes, leads=after.region))
+    return out
+
+
+def _same_limb(demo: DemoPolicy, i: int, surface: str) -> bool:
+    action = demo.actions[i]
+    return action is not None and limb_of(action) == limb_of(surface)
 
 
 def find_cycles(names: Sequence[str], *, first: int = 0) -> tuple[int, int, int] | None:
@@ -379,7 +397,9 @@ def _pool(
         for d in demos
         if all(s.pelvis is None for s in d.states)
     ]
-    top, edge = (np.concatenate(x) for x in zip(*map(_angles, demos), strict=True))
+    top, edge = (
+        np.concatenate(x) for x in zip(*map(pelvis_samples, demos), strict=True)
+    )
     return GeneralPolicy(
         options=tuple(options),
         over_top=fit_distribution(top),
@@ -404,7 +424,7 @@ def fit_distribution(angles: np.ndarray) -> PelvisDistribution:
     return PelvisDistribution(mean=mean, sigma=sigma, samples=n)
 
 
-def _angles(demo: DemoPolicy) -> tuple[np.ndarray, np.ndarray]:
+def pelvis_samples(demo: DemoPolicy) -> tuple[np.ndarray, np.ndarray]:
     """Angles (n, 3) of the pelvis over the top and near an edge, a row a state.
 
     Over the top yaw is against the edge that was climbed up, near an edge against that
