@@ -335,15 +335,15 @@ def _standing(f: _Frame, depth: float) -> np.ndarray:
     return _posed(f, (depth, 0.0, hips, 0.0), (depth, 0.0, shoulders, 0.0))
 
 
-def _bent_over(f: _Frame, h: float, wrist: float, roll: float = 0.0) -> np.ndarray:
-    """Standing, hands on the table."""
+def _bent_over(f: _Frame, h: float, wrist: float) -> np.ndarray:
+    """Standing, hands on the table, hips as far back as the trunk is long."""
     share = (wrist - _REACH_FROM) / (_REACH_TO - _REACH_FROM)
-    hips = min(0.85, h + 0.38)
+    hips, chest = min(0.85, h + 0.38), h + 0.54 - 0.04 * share
+    back = np.sqrt((0.95 * TRUNK) ** 2 - (chest - hips) ** 2)
     return _posed(
         f,
-        (-0.36 + 0.08 * share, 0.0, hips, 0.6 + 0.2 * share),
-        (wrist - 0.22, 0.0, h + 0.54 - 0.04 * share, 1.0 + 0.2 * share),
-        roll,
+        (wrist - 0.22 - back, 0.0, hips, 0.6 + 0.2 * share),
+        (wrist - 0.22, 0.0, chest, 1.0 + 0.2 * share),
     )
 
 
