@@ -26,7 +26,7 @@ from clamber.errors import InputError
 from clamber.io import load_sequence, save_sequence
 from clamber.policy import GeneralPolicy, pelvis_rotation, wrap
 from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy, quat_from_matrix
+from clamber.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
 
 HEIGHT = 0.6
 SUBJECT = {
@@ -550,8 +550,6 @@ def test_the_distributions_do_not_depend_on_where_the_world_lies():
 
 
 def pelvis_rotation_of(pelvis: np.ndarray) -> np.ndarray:
-    from clamber.se3 import matrix_from_quat
-
     return matrix_from_quat(pelvis[3:])
 
 
