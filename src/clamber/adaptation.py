@@ -18,7 +18,7 @@ from clamber.errors import InputError, Status
 from clamber.model import World, build_world
 from clamber.moves import Step, split_moves
 from clamber.path import ARC_WEIGHT, Phase, bridge
-from clamber.pipeline import Plan, search_steps
+from clamber.pipeline import Plan, search_steps, timed
 from clamber.posture import direct
 from clamber.posture.ik import IK, ContactGoal, support_rotation
 from clamber.posture.keyframe import Keyframe, KeyframeTask, bearing_frames
@@ -148,16 +148,9 @@ def _rest(
         return Adapted(world=world, trajectory=None, keyframes=(key,), missed=str(e))
     steps = _from_here(split_moves(sequence, world)[0][made:], key, world)
     found, _ = search_steps(ik, steps, plan.options, start=key)
-    phases = [*lead, *(p for path in found.paths for p in path.phases)]
-    ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in found.paths])
-    trajectory = None
-    if phases:
-        trajectory = build_trajectory(
-            world, phases, speed=plan.options.speed, keyframe_after=ends.tolist()
-        )
     return Adapted(
         world=world,
-        trajectory=trajectory,
+        trajectory=timed(world, found.paths, plan.options.speed, lead),
         keyframes=found.keyframes,
         missed=found.missed[0].reason if found.missed else "",
     )

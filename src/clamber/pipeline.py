@@ -16,7 +16,7 @@ from clamber.contact import ContactSequence
 from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
 from clamber.moves import Skipped, Step, split_moves
-from clamber.path import Path, overlap, watched_pairs
+from clamber.path import Path, Phase, overlap, watched_pairs
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
@@ -109,15 +109,9 @@ def plan(
 
     steps, skipped = split_moves(goal, world)
     found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
-    trajectory = None
-    if found.paths:
-        report("trajectory", 1.0, "")
-        phases = [p for path in found.paths for p in path.phases]
-        ends = np.cumsum([len(path.phases) for path in found.paths]) - 1
-        trajectory = build_trajectory(
-            world, phases, speed=options.speed, keyframe_after=ends.tolist()
-        )
-        clock.lap("trajectory")
+    report("trajectory", 1.0, "")
+    trajectory = timed(world, found.paths, options.speed)
+    clock.lap("trajectory")
     return Plan(
         world=world,
         options=used,
@@ -169,6 +163,32 @@ def search_steps(
             break
     assert found is not None
     return found, used
+
+
+def timed(
+    world: World,
+    paths: Sequence[Path],
+    speed: float | Literal["max"],
+    lead: Sequence[Phase] = (),
+) -> Trajectory | None:
+    """The trajectory of `lead`, which leads to the first keyframe, and the paths.
+
+    Args:
+        world: Robot and scene.
+        paths: Between neighbouring keyframes.
+        speed: Largest joint speed [rad/s], or `max`.
+        lead: Phases before the first path.
+
+    Returns:
+        None where nothing moves.
+    """
+    phases = [*lead, *(p for path in paths for p in path.phases)]
+    if not phases:
+        return None
+    ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in paths])
+    return build_trajectory(
+        world, phases, speed=speed, keyframe_after=ends.astype(int).tolist()
+    )
 
 
 class _Clock:
