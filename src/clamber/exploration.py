@@ -5,11 +5,12 @@ limb to a contact: a surface of it, on a support, at a place. An action costs
 
     -ln p(surface | region)  +  max(0, r - 1)
 
-with p how often a demonstration takes it in such a region (one more than counted, so
-that nothing is out of the question) and r the distance from shoulder or hip to the
-place, in lengths of the limb. The state with the least cost so far, and at least as much
-as the limbs that are yet to get there will cost, comes first. Whether a step is possible
-is known when it has been planned, and only what comes first is planned.
+with p how often a demonstration takes it in such a region (what it never does is
+unlikely, not out of the question), and r the distance from shoulder or hip to the place,
+in lengths of the limb. What is left to do is reckoned from the limbs that have yet to
+get to where the demonstration ends, and from how far away they are. The least sum of
+both comes first. Whether a step is possible is known when it has been planned; only what
+comes first is.
 """
 
 from __future__ import annotations
@@ -35,14 +36,14 @@ from clamber.posture.keyframe import Keyframe
 from clamber.scaling import near_edge
 from clamber.scene import GROUND
 from clamber.se3 import quat_from_matrix
-from clamber.search import plan_step, plan_steps, standing
+from clamber.search import plan_step, standing
 
 Counts = Mapping[tuple[Region, str], float]
 
 SAME_PLACE = 0.08  # [m] a surface that comes down nearer to where it was has not moved
 INSET = 0.05  # [m] of a place from the border of its support
 TRUNK_GIVE = 1.1  # a bent waist: longest over present distance of shoulders and hips
-MENDING = 2.0  # cost of looking for a step with earlier contacts elsewhere
+FAR = 0.25  # of what a limb has left: each length of it that it is away
 AGAIN = 0.7  # cost of each step to the same surfaces on the same supports before
 EAGER = 3.0  # what is left counts so often: a sequence soon rather than the likeliest
 UNSEEN = 0.25  # times that every action counts as seen besides
@@ -113,10 +114,11 @@ def action_counts(sequence: ContactSequence, world: World) -> Counts:
         world: Robot and scene.
     """
     counts: Counter[tuple[Region, str]] = Counter()
+    stance = sequence.stances[0].contacts
     for step in split_moves(sequence, world)[0]:
         if step.move.makes is not None:
-            before = sequence.stances[step.stance - 1]
-            counts[before.region, step.move.makes.surface] += 1
+            counts[region_of(stance), step.move.makes.surface] += 1
+        stance = _after(stance, step.move)
     return counts
 
 
@@ -142,7 +144,6 @@ class _Entry:
     order: int
     state: _State = field(compare=False)
     action: _Action = field(compare=False)
-    mends: bool = field(compare=False)
 
 
 def explore(
@@ -178,16 +179,16 @@ def explore(
 
     def expand(state: _State) -> None:
         for a in guide.actions(ik.kin, state):
-            push(state, a, mends=False)
+            push(state, a)
 
-    def priority(state: _State, a: _Action, *, mends: bool) -> float:
+    def priority(state: _State, a: _Action) -> float:
         after = _after(state.keyframes[-1].stance, a.step.move)
-        again = MENDING * mends + AGAIN * often[_kind(after)]
+        again = AGAIN * often[_kind(after)]
         return state.cost + a.price + EAGER * guide.left(after) + again
 
-    def push(state: _State, a: _Action, *, mends: bool) -> None:
-        p = priority(state, a, mends=mends)
-        heapq.heappush(queue, _Entry(p, next(order), state, a, mends))
+    def push(state: _State, a: _Action) -> None:
+        entry = _Entry(priority(state, a), next(order), state, a)
+        heapq.heappush(queue, entry)
 
     def ended(found: _State | None, stop: Stop) -> Explored:
         state = found or first
@@ -213,16 +214,14 @@ def explore(
         after = _after(state.keyframes[-1].stance, action.step.move)
         if _key(after) in seen:  # reached meanwhile, at less cost
             continue
-        if priority(state, action, mends=entry.mends) > entry.priority:
-            push(state, action, mends=entry.mends)  # it is less promising than it was
+        if priority(state, action) > entry.priority:
+            push(state, action)  # it is less promising than it was
             continue
         tries += 1
         often[_kind(after)] += 1
         report("explore", tries / bounds.tries, str(action.step.move))
-        reached = _take(ik, state, action, options, entry.mends)
+        reached = _take(ik, state, action, options)
         if reached is None:
-            if not entry.mends and state.paths:
-                push(state, action, mends=True)
             continue
         seen |= {_key(after), _key(reached.keyframes[-1].stance)}
         if guide.arrived(reached.keyframes[-1]):
@@ -234,35 +233,9 @@ def explore(
 
 
 def _take(
-    ik: IK, state: _State, action: _Action, options: PlanOptions, mends: bool
+    ik: IK, state: _State, action: _Action, options: PlanOptions
 ) -> _State | None:
-    """The state that an action leads to; None where the step cannot be planned.
-
-    Args:
-        ik: Workspace.
-        state: Before it.
-        action: To take.
-        options: How it is planned.
-        mends: All steps are planned again from the first, earlier contacts elsewhere
-            where this one asks for it.
-    """
-    steps = (*state.steps, action.step)
-    cost = state.cost + action.price
-    if mends:
-        found = plan_steps(
-            ik,
-            steps,
-            options.method,
-            options.keyframe,
-            lap=lambda stage: None,
-            report=lambda stage, share, note: None,
-            start=state.keyframes[0],
-        )
-        if found.missed:
-            return None
-        return _State(
-            keyframes=found.keyframes, paths=found.paths, steps=steps, cost=cost
-        )
+    """The state that an action leads to; None where the step cannot be planned."""
     result = plan_step(
         ik,
         state.keyframes[-1],
@@ -276,8 +249,8 @@ def _take(
     return _State(
         keyframes=(*state.keyframes, result[0]),
         paths=(*state.paths, result[1]),
-        steps=steps,
-        cost=cost,
+        steps=(*state.steps, action.step),
+        cost=state.cost + action.price,
     )
 
 
@@ -301,26 +274,34 @@ def _kind(stance: Sequence[Contact]) -> frozenset:
 
 
 def _as_sequence(world: World, state: _State) -> ContactSequence:
-    """The stances of a state's keyframes, one a second."""
-    postures = [{}, *(s.target.posture for s in state.steps)]
+    """The stances that a state has come through, one a second.
+
+    A contact is where it was made: a foot that goes on tiptoe later has not moved.
+    """
+    contacts = list(state.keyframes[0].stance)
+    stances = [Stance(contacts=tuple(contacts))]
+    for key, step in zip(state.keyframes[1:], state.steps, strict=True):
+        fresh = {c.surface: c for c in key.stance}
+        contacts = [
+            c
+            if step.move.makes is None or c.surface != step.move.makes.surface
+            else fresh[c.surface]
+            for c in _after(contacts, step.move)
+        ]
+        stances.append(Stance(contacts=tuple(contacts), posture=step.target.posture))
     return ContactSequence(
         source="search",
         subject=None,
         scene=world.scene,
-        stances=tuple(
-            Stance(contacts=k.stance, posture=p)
-            for k, p in zip(state.keyframes, postures, strict=True)
-        ),
-        t=np.arange(len(state.keyframes) + 1, dtype=float),
+        stances=tuple(stances),
+        t=np.arange(len(stances) + 1, dtype=float),
     )
 
 
 class _Guidance:
     """What a demonstration says of where to go, and by which actions."""
 
-    def __init__(
-        self, world: World, sequence: ContactSequence, counts: Counts
-    ) -> None:
+    def __init__(self, world: World, sequence: ContactSequence, counts: Counts) -> None:
         self._world, self._sequence, self._counts = world, sequence, counts
         goal = sequence.stances[-1].contacts
         limb_of = world.robot.limb_of
@@ -361,11 +342,25 @@ class _Guidance:
 
     def left(self, stance: Sequence[Contact]) -> float:
         """What the limbs that are not on their last support will cost at least."""
-        on = {self._world.robot.limb_of(c.surface).name: c.support for c in stance}
-        wrong = sum(on.get(limb) != support for limb, support in self._goal.items())
+        on = {self._world.robot.limb_of(c.surface).name: c for c in stance}
         ends = set(self._goal.values())
-        wrong += sum(s not in ends for limb, s in on.items() if limb not in self._goal)
-        return wrong * self._least
+        total = 0.0
+        for limb in self._world.robot.limbs.values():
+            c = on.get(limb.name)
+            goal = self._goal.get(limb.name)
+            if goal is None:  # in the air at the end, or on what the others end on
+                if c is None or c.support in ends:
+                    continue
+                goal = min(ends)
+            elif c is not None and c.support == goal:
+                continue
+            lengths = 1.0
+            if c is not None:
+                away = c.position - self._nearest(goal, c.position)
+                length = max(self._length[s] for s in limb.surfaces)
+                lengths = float(np.linalg.norm(away)) / length
+            total += 1.0 + FAR * lengths
+        return total * self._least
 
     def actions(self, kin: Kinematics, state: _State) -> list[_Action]:
         """All that may be done in a state."""
@@ -374,9 +369,7 @@ class _Guidance:
         kin.update(key.q)
         out = []
         for limb in world.robot.limbs.values():
-            present = next(
-                (c for c in key.stance if c.surface in limb.surfaces), None
-            )
+            present = next((c for c in key.stance if c.surface in limb.surfaces), None)
             others = [c for c in key.stance if c is not present]
             root = kin.landmark(limb.root)[1].copy()
             for surface in limb.surfaces:
@@ -394,34 +387,33 @@ class _Guidance:
                         r = float(np.linalg.norm(c.position - root))
                         stretch = max(0.0, r / self._length[surface] - 1.0)
                         price = self._surprise(region, surface) + stretch
-                        out.append(
-                            _Action(step=self._step(key, move), price=price)
-                        )
+                        out.append(_Action(step=self._step(key, move), price=price))
         return out
 
     def _surprise(self, region: Region, surface: str) -> float:
         """-ln p(surface | region)."""
         names = self._world.surfaces
-        total = sum(self._counts.get((region, s), 0.0) for s in names)
         count = self._counts.get((region, surface), 0.0)
+        total = sum(self._counts.get((region, s), 0.0) for s in names)
         return -math.log((count + UNSEEN) / (total + UNSEEN * len(names)))
 
-    def _contacts(
-        self, surface: str, support: str, root: np.ndarray
-    ) -> list[Contact]:
+    def _contacts(self, surface: str, support: str, root: np.ndarray) -> list[Contact]:
         """Where a surface may be put: as demonstrated, or below what it supports."""
-        s = self._world.supports[support]
-        half = np.maximum(s.polygon.max(axis=0) - INSET, 0.0)
-        local = s.rotation.T @ (root - s.position)
-        local = np.array([*np.clip(local[:2], -half, half), 0.0])
         below = Contact(
             surface=surface,
             support=support,
-            position=s.position + s.rotation @ local,
+            position=self._nearest(support, root),
             quaternion=self._turns[support],
         )
         known = self._places.get((surface, support), [])
         return [*known, *([below] if all(not _same(below, k) for k in known) else [])]
+
+    def _nearest(self, support: str, p: np.ndarray) -> np.ndarray:
+        """The nearest place (3,) on a support, `INSET` from its border."""
+        s = self._world.supports[support]
+        half = np.maximum(s.polygon.max(axis=0) - INSET, 0.0)
+        local = s.rotation.T @ (p - s.position)
+        return s.position + s.rotation @ np.array([*np.clip(local[:2], -half, half), 0])
 
     def _step(self, key: Keyframe, move: Move) -> Step:
         """With the demonstrated stance most like the one it leads to."""
@@ -445,7 +437,7 @@ class _Guidance:
         return float(upper + (by_middle if nearer else by_end))
 
     def _within_reach(self, a: Contact, b: Contact) -> bool:
-        """Can two contacts be made at once? (If not, no posture closes both.)"""
+        """Whether some posture may close both contacts."""
         limb_of = self._world.robot.limb_of
         roots = [self._kin.landmark(limb_of(x.surface).root)[1] for x in (a, b)]
         trunk = TRUNK_GIVE * float(np.linalg.norm(roots[0] - roots[1]))

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from clamber.contact import ContactSequence
+from clamber.contact import Contact, ContactSequence
 from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
 from clamber.moves import Skipped, Step, split_moves
@@ -54,6 +54,29 @@ class PlanOptions:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Midway:
+    """Where a robot is in the middle of a climb.
+
+    Attributes:
+        made: Steps of the plan's sequence that have been made.
+        contacts: Its stance, each contact where it is.
+        loaded: Those of them that bear load already.
+        q: (nq,) its posture.
+    """
+
+    made: int
+    contacts: tuple[Contact, ...]
+    loaded: tuple[Contact, ...]
+    q: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Copy the posture and make it read-only."""
+        q = np.array(self.q, dtype=float)
+        q.setflags(write=False)
+        object.__setattr__(self, "q", q)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Plan:
     """Everything that planning found.
 
@@ -67,6 +90,10 @@ class Plan:
         trajectory: None where not even one move was found.
         complete: Every step that the demonstration asks for has a path.
         timings: Seconds by stage.
+        midway: Where it begins, where that is not the scene's start: the rest of a
+            climb, from its first keyframe, which is settled into.
+        instead: Why it makes other contacts than the demonstrated ones, and which;
+            empty where it does not.
     """
 
     world: World
@@ -78,6 +105,8 @@ class Plan:
     trajectory: Trajectory | None
     complete: bool
     timings: dict[str, float]
+    midway: Midway | None = None
+    instead: str = ""
 
 
 def plan(
