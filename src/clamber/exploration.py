@@ -6,11 +6,11 @@ limb to a contact: a surface of it, on a support, at a place. An action costs
     -ln p(surface | region)  +  max(0, r - 1)
 
 with p how often a demonstration takes it in such a region (what it never does is
-unlikely, not out of the question), and r the distance from shoulder or hip to the place,
-in lengths of the limb. What is left to do is reckoned from the limbs that have yet to
-get to where the demonstration ends, and from how far away they are. The least sum of
-both comes first. Whether a step is possible is known when it has been planned; only what
-comes first is.
+unlikely, not out of the question), and r the distance from shoulder or hip to the
+place, in lengths of the limb. What is left to do is reckoned from the limbs that have
+yet to get to where the demonstration ends, and from how far away they are. The least
+sum of both comes first. Whether a step is possible is known when it has been planned;
+only what comes first is.
 """
 
 from __future__ import annotations

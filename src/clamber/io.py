@@ -33,7 +33,7 @@ from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
 from clamber.errors import InputError, Status
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
-from clamber.pipeline import Plan, PlanOptions, Skipped
+from clamber.pipeline import Midway, Plan, PlanOptions, Skipped
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
 from clamber.scene import Box, Scene, input_error
@@ -547,6 +547,22 @@ class _SkippedFile(pydantic.BaseModel):
     missed: bool = False
 
 
+class _MidwayFile(pydantic.BaseModel):
+    made: int = pydantic.Field(ge=0)
+    qpos: list[float]
+    contacts: list[_ContactFile]
+    loaded: list[str]
+
+    def midway(self) -> Midway:
+        contacts = tuple(c.contact() for c in self.contacts)
+        return Midway(
+            made=self.made,
+            contacts=contacts,
+            loaded=tuple(c for c in contacts if c.surface in self.loaded),
+            q=np.array(self.qpos),
+        )
+
+
 class _PlanFile(pydantic.BaseModel):
     options: dict[str, Any]
     robot: RobotFile
@@ -554,6 +570,8 @@ class _PlanFile(pydantic.BaseModel):
     keyframes: list[_KeyframeFile] = pydantic.Field(min_length=1)
     skipped: list[_SkippedFile]
     complete: bool
+    midway: _MidwayFile | None = None
+    instead: str = ""
 
 
 class _TimingsFile(pydantic.BaseModel):
@@ -606,7 +624,20 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "skipped": [asdict(s) for s in plan.skipped],
         "sequence": sequence_fields(plan.sequence)
         | {"scene": scene_fields(world.scene)},
-    }
+    } | _other_plan_fields(plan)
+
+
+def _other_plan_fields(plan: Plan) -> dict[str, Any]:
+    """What a plan has that is not of a whole climb as demonstrated."""
+    out: dict[str, Any] = {"instead": plan.instead} if plan.instead else {}
+    if plan.midway is not None:
+        out["midway"] = {
+            "made": plan.midway.made,
+            "qpos": plan.midway.q,
+            "contacts": [contact_fields(c) for c in plan.midway.contacts],
+            "loaded": [c.surface for c in plan.midway.loaded],
+        }
+    return out
 
 
 def _robot_fields(robot: Robot) -> dict[str, Any]:
@@ -739,6 +770,13 @@ def load_plan(folder: str | Path) -> Plan:
     scene, followed = _planned(folder)
     world = _load_world(scene, _robot(file.robot), sequence.scene)
     nq = world.model.nq
+    if file.midway is not None and len(file.midway.qpos) != nq:
+        raise InputError(
+            f"{nq} numbers, as many as {SCENE} has coordinates",
+            source=path,
+            field="midway.qpos",
+            value=f"{len(file.midway.qpos)} numbers",
+        )
     for i, k in enumerate(file.keyframes):
         if len(k.qpos) != nq:
             raise InputError(
@@ -772,6 +810,8 @@ def load_plan(folder: str | Path) -> Plan:
         trajectory=trajectory,
         complete=file.complete,
         timings=timings,
+        midway=None if file.midway is None else file.midway.midway(),
+        instead=file.instead,
     )
 
 
