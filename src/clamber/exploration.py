@@ -66,11 +66,11 @@ class Bounds:
 
     Attributes:
         tries: Steps that it plans at most; 0: none, there is no search. A step takes
-            from a tenth of a second to some seconds.
+            from a tenth of a second to two seconds.
         depth: Moves of a sequence at most.
     """
 
-    tries: int = 80
+    tries: int = 100
     depth: int = 12
 
     def __post_init__(self) -> None:
