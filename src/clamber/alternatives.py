@@ -184,8 +184,9 @@ def plan_cost(made: Plan) -> float:
         if c is None:
             continue
         q = made.keyframes[-1].q if made.keyframes else world.home
+        total += _way(kin, q, c)
         root = kin.landmark(world.robot.limb_of(c.surface).root)[1]
-        total += _way(kin, q, c) + projected_distance(c.position, root)
+        total += projected_distance(c.position, root)
     return total
 
 
@@ -502,6 +503,8 @@ def midway_of(
     world = build_world(plan.world.robot, scene)
     kin = Kinematics(world)
     kin.update(q)
+    for surface, support in (touching or {}).items():
+        _check_named(kin, surface, support, source)
     contacts = []
     for limb in world.robot.limbs.values():
         for surface in reversed(limb.surfaces):
@@ -516,8 +519,6 @@ def midway_of(
                 )
                 contacts.append(felt_contact(kin, c))
                 break
-    for surface, support in (touching or {}).items():
-        _check_named(kin, surface, support, source)
     if not contacts:
         raise InputError(
             "a posture with a surface on a support", source=source, field="contacts"
@@ -606,8 +607,7 @@ def _alike(
     same, away = 0, 0.0
     for limb, c in on.items():
         there = now.get(limb)
-        if _made(c) == _made(there):
+        if c is not None and there is not None and _made(c) == _made(there):
             same += 1
-            if c is not None and there is not None:
-                away += float(np.linalg.norm(c.position - there.position))
+            away += float(np.linalg.norm(c.position - there.position))
     return same, -away

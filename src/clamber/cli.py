@@ -200,18 +200,11 @@ class SearchFlags:
 
     def bounds(self) -> clamber.Bounds:
         """The record."""
-        with _flag_blamed("--search."):
+        try:
             return clamber.Bounds(tries=self.tries, depth=self.depth)
-
-
-@contextlib.contextmanager
-def _flag_blamed(prefix: str) -> Iterator[None]:
-    """Name the flag of a value that cannot be."""
-    try:
-        yield
-    except InputError as e:
-        source = f"{prefix}{e.field}"
-        raise InputError(e.expected, source=source, value=e.value) from e
+        except InputError as e:
+            source = f"--{e.field}"
+            raise InputError(e.expected, source=source, value=e.value) from e
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,7 +45,7 @@ INSET = 0.05  # [m] of a place from the border of its support
 TRUNK_GIVE = 1.1  # a bent waist: longest over present distance of shoulders and hips
 FAR = 0.25  # of what a limb has left: each length of it that it is away
 AGAIN = 0.7  # cost of each step to the same surfaces on the same supports before
-EAGER = 3.0  # what is left counts so often: a sequence soon rather than the likeliest
+EAGER = 1.25  # weight of what is left: a sequence soon rather than the likeliest
 UNSEEN = 0.25  # times that every action counts as seen besides
 CELL = 0.05  # [m] contacts as near to one another make the same state
 GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
@@ -81,7 +81,8 @@ class Bounds:
         """
         for name in ("tries", "depth"):
             if getattr(self, name) < 0:
-                raise InputError("0 or more", field=name, value=getattr(self, name))
+                value = getattr(self, name)
+                raise InputError("0 or more", field=f"search.{name}", value=value)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -325,9 +326,7 @@ class _Guidance:
             )
             for name, support in world.supports.items()
         }
-        self._least = min(
-            self._surprise(r, s) for r in ("G", "M", "O") for s in world.surfaces
-        )
+        self._even = math.log(len(world.surfaces))  # what an action costs unguided
 
     def arrived(self, key: Keyframe) -> bool:
         """Is every limb where the demonstration ends, and the pelvis at the goal?"""
@@ -341,7 +340,7 @@ class _Guidance:
         return near or not self._leads_back
 
     def left(self, stance: Sequence[Contact]) -> float:
-        """What the limbs that are not on their last support will cost at least."""
+        """What it will cost to get the limbs to the supports that they end on."""
         on = {self._world.robot.limb_of(c.surface).name: c for c in stance}
         ends = set(self._goal.values())
         total = 0.0
@@ -360,7 +359,7 @@ class _Guidance:
                 length = max(self._length[s] for s in limb.surfaces)
                 lengths = float(np.linalg.norm(away)) / length
             total += 1.0 + FAR * lengths
-        return total * self._least
+        return total * self._even
 
     def actions(self, kin: Kinematics, state: _State) -> list[_Action]:
         """All that may be done in a state."""
