@@ -568,6 +568,14 @@ def test_a_touch_is_a_force_near_the_planned_place(
     assert pilot._touches(c) == touches
 
 
+def test_what_is_felt_for_may_be_met_further_aside(pilot, hands_plan):
+    """A limb that rolled while it felt its way down has its contact where it is."""
+    c = placed(pilot, hands_plan, 1, 0.0, 1.5 * NEAR)
+    feel(pilot, LHand=50.0)
+    assert pilot._touches(c, REACH)
+    assert not pilot._touches(placed(pilot, hands_plan, 1, 0.0, 1.1 * REACH), REACH)
+
+
 def test_a_force_along_the_support_is_no_touch(pilot, hands_plan):
     c = placed(pilot, hands_plan, 1)
     pilot._load[pilot._surfaces.index("LHand")] = [80.0, 60.0, 0.0]

@@ -215,12 +215,15 @@ def feeling(
     if com_margin(ik.kin.com[:2], support_polygon(points)) <= 0:
         return None
     support = world.supports[contact.support]
+    # Straight down from where the limb is: a round surface has rolled since its plan.
+    p = ik.kin.contact_point(contact.surface, support.normal)
+    top = p - support.normal * float((p - contact.position) @ support.normal)
     nodes, depths = [q], [0.0]
     for depth in np.linspace(0.0, REACH, FEELING_NODES)[1:].tolist():
         goal = ContactGoal(
             surface=contact.surface,
             support=contact.support,
-            position=contact.position - depth * support.normal,
+            position=top - depth * support.normal,
             rotation=support_rotation(support, contact.quaternion),
             hard=False,
             reference=ARC_WEIGHT,

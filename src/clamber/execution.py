@@ -363,7 +363,7 @@ class Execution:
             assert t is not None
             self._set(t, i)
             yield
-            felt = c if self._touches(c) else self._other(c)
+            felt = c if self._touches(c, REACH) else self._other(c)
             if felt is not None:
                 self._velocity = np.zeros(len(self._dadr))
                 return felt
@@ -454,12 +454,12 @@ class Execution:
         n = self._world.supports[c.support].normal
         return float(self._load[self._surfaces.index(c.surface)] @ n)
 
-    def _touches(self, c: Contact) -> bool:
+    def _touches(self, c: Contact, aside: float = NEAR) -> bool:
         """Force on the surface, not far from where its contact was planned."""
         if self._force(c) < TOUCH:
             return False
         up, side = self._off(c)
-        return side < NEAR and abs(up) < REACH + 0.02
+        return side < aside and abs(up) < REACH + 0.02
 
     def _other(self, c: Contact) -> Contact | None:
         """The contact of another surface of the limb that bears in place of this."""
