@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
-from clamber import alternatives
+from clamber import alternatives, cli
 from clamber.alternatives import (
     Ranked,
     contact_alternatives,
@@ -20,8 +22,10 @@ from clamber.alternatives import (
     steps_made,
 )
 from clamber.contact import Contact, ContactSequence, Stance
+from clamber.disturbance import Disturbance
 from clamber.errors import InputError
 from clamber.exploration import Bounds, Explored, Stop
+from clamber.io import load_plan, load_state, save_plan, save_sequence
 from clamber.model import Kinematics, build_world
 from clamber.moves import Skipped, split_moves
 from clamber.scene import Scene
@@ -456,3 +460,130 @@ def test_contacts_of_the_middle_are_of_the_moved_world(demo_plan):
         if c.support == "box":
             p = kin.contact_point(c.surface, np.array([0.0, 0.0, 1.0]))
             assert np.allclose(c.position, p)
+
+
+# On disk and from the command line.
+
+
+def test_a_plan_from_the_middle_survives_the_disk(demo_plan, tmp_path):
+    key = demo_plan.keyframes[2]
+    now = midway_of(demo_plan, demo_plan.world.scene, key.q)
+    now = replace(now, loaded=now.contacts[1:])
+    save_plan(replace(demo_plan, midway=now, instead="because"), tmp_path)
+    again = load_plan(tmp_path)
+    assert again.instead == "because"
+    assert again.midway.made == 2
+    assert np.array_equal(again.midway.q, key.q)
+    assert [c.surface for c in again.midway.loaded] == [c.surface for c in now.loaded]
+    assert all(c in again.midway.contacts for c in again.midway.loaded)
+    for a, b in zip(again.midway.contacts, now.contacts, strict=True):
+        assert np.array_equal(a.position, b.position)
+        assert (a.surface, a.support) == (b.surface, b.support)
+    save_plan(demo_plan, tmp_path)
+    assert load_plan(tmp_path).midway is None
+    assert "midway" not in json.loads((tmp_path / "plan.json").read_text())
+
+
+def test_a_start_in_the_middle_is_not_disturbed(demo_plan):
+    now = midway_of(demo_plan, demo_plan.world.scene, demo_plan.keyframes[2].q)
+    middle = replace(demo_plan, midway=now)
+    with pytest.raises(InputError, match="begins in the middle of a climb"):
+        simulate(middle, disturbance=Disturbance(x=0.01))
+
+
+def state_of(plan, k: int) -> dict:
+    q = plan.keyframes[k].q
+    joints = dict(zip(plan.world.joints, q[plan.world.qadr].tolist(), strict=True))
+    return {
+        "position": q[:3].tolist(),
+        "quaternion": q[3:7].tolist(),
+        "joints": joints,
+        "contacts": {c.surface: c.support for c in plan.keyframes[k].stance},
+    }
+
+
+def test_a_state_file_gives_posture_and_contacts(demo_plan, tmp_path):
+    path = tmp_path / "state.yaml"
+    state = state_of(demo_plan, 2)
+    path.write_text(yaml.safe_dump(state))
+    q, touching = load_state(demo_plan, tmp_path, str(path))
+    assert np.allclose(q, demo_plan.keyframes[2].q)
+    assert touching == state["contacts"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"joints": {"Tail": 0.0}}, "joints.Tail is 0.0; expected the joints of coman"),
+        ({"joints": {}}, "expected the joints of coman"),
+        ({"quaternion": [2.0, 0.0, 0.0, 0.0]}, "expected a unit quaternion"),
+        ({"position": [0.0, 0.0]}, "position"),
+        ({"position": [float("nan"), 0.0, 0.0]}, "expected finite numbers only"),
+        ({"velocity": 1.0}, "velocity is 1.0; expected no such field"),
+    ],
+)
+def test_a_state_that_cannot_be_is_the_users_mistake(demo_plan, tmp_path, change, said):
+    path = tmp_path / "state.yaml"
+    path.write_text(yaml.safe_dump(state_of(demo_plan, 2) | change))
+    with pytest.raises(InputError) as wrong:
+        load_state(demo_plan, tmp_path, str(path))
+    assert str(path) in str(wrong.value)
+    assert said in str(wrong.value)
+
+
+def test_replan_prints_differences_and_plans_and_nothing_else(
+    demo_sequence, tmp_path, capsys
+):
+    source = tmp_path / "sequence.json"
+    save_sequence(demo_sequence, source)
+    out = tmp_path / "out"
+    args = ["replan", str(source), "--height", "0.15", "--out", str(out), "--json"]
+    assert cli.main(args) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert set(record) == {"differences", "plans"}
+    assert record["differences"] == [
+        list(d) for d in contact_differences(demo_sequence)
+    ]
+    assert {frozenset(p["surfaces"]) for p in record["plans"]} == {
+        frozenset({a, b}) for a in ("LHand", "LElbow") for b in ("RHand", "RElbow")
+    }
+    assert all(set(p) == {"surfaces", "cost", "stable"} for p in record["plans"])
+    costs = [p["cost"] for p in record["plans"]]
+    assert costs == sorted(costs)
+    best = load_plan(out)
+    assert best.complete
+    assert plan_cost(replace(best, keyframes=best.keyframes[:1])) > 0
+    kept = json.loads((out / "replan.json").read_text())
+    assert kept["search"] is None
+    assert [p["cost"] for p in kept["plans"]] == costs
+
+
+def test_replan_with_no_stable_plan_exits_with_1(
+    failing, demo_sequence, tmp_path, capsys
+):
+    failing("LFoot")
+    source = tmp_path / "sequence.json"
+    save_sequence(demo_sequence, source)
+    args = ["replan", str(source), "--height", "0.275", "--out", str(tmp_path)]
+    assert cli.main([*args, "--search.tries", "2", "--json"]) == 1
+    record = json.loads(capsys.readouterr().out)
+    assert not any(p["stable"] for p in record["plans"])
+    kept = json.loads((tmp_path / "replan.json").read_text())
+    assert kept["search"] == {"states": 3, "tries": 2, "stop": Stop.TRIES.value}
+    assert kept["plans"][0]["missed"] == ["too high"]
+
+
+def test_replan_from_a_state_plans_the_rest(demo_plan, tmp_path, capsys):
+    run, out = tmp_path / "run", tmp_path / "rest"
+    run.mkdir()
+    save_plan(demo_plan, run)
+    state = tmp_path / "state.yaml"
+    state.write_text(yaml.safe_dump(state_of(demo_plan, 2)))
+    args = ["replan", str(run), "--from", str(state), "--out", str(out), "--json"]
+    assert cli.main(args) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert (record["made"], record["complete"]) == (2, True)
+    rest = load_plan(out)
+    assert rest.midway.made == 2
+    assert len(rest.keyframes) == 5
+    assert np.allclose(rest.trajectory.q[0], demo_plan.keyframes[2].q, atol=0.01)

@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clamber.adaptation import adapt_plan, felt_contact, from_here, settle
+from clamber.adaptation import adapt_plan, felt_contact, settle
 from clamber.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError
 from clamber.exploration import (
@@ -434,7 +434,7 @@ def replan_rest(
         report("replan", i / len(candidates), ", ".join(a.surfaces))
         here = replace(now, made=steps_made(a.sequence, world, now.contacts))
         steps = split_moves(a.sequence, world)[0][here.made :]
-        steps = from_here(steps, now.contacts, world)
+        steps = _leaving(steps, now.contacts, world)
         found, used = search_steps(ik, steps, options, start=start)
         planned.append((a, _plan_of(world, used, a.sequence, found, here, lead)))
     report("replan", 1.0, "")
@@ -454,6 +454,21 @@ def replan_rest(
         _plan_of(world, options, whole, explored, replace(now, made=k), lead),
         instead=f"{why}; instead, found by search: {used}",
     )
+
+
+def _leaving(
+    steps: Sequence[Step], stance: Sequence[Contact], world: World
+) -> list[Step]:
+    """The steps of an alternative, where each limb leaves what it is really on.
+
+    It may be on a surface that the alternative does without.
+    """
+    on = {world.robot.limb_of(c.surface).name: (c.surface,) for c in stance}
+    out = []
+    for step in steps:
+        breaks = on.pop(step.move.limb, step.move.breaks)
+        out.append(replace(step, move=replace(step.move, breaks=breaks)))
+    return out
 
 
 def _from_standing(
