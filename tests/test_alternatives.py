@@ -265,6 +265,22 @@ def test_where_nothing_is_found_it_says_what_was_tried(failing, demo_sequence, c
     assert Stop.TRIES.value in found.instead
 
 
+def test_where_no_alternative_is_stable_the_search_takes_over(
+    failing, demo_sequence, coman, tmp_path
+):
+    failing("LFoot")
+    found = plan_or_replan(demo_sequence, coman, Scene.from_height(0.275))
+    assert found.complete
+    made = [p.transition.move.makes.surface for p in found.paths]
+    assert found.instead.endswith(f"instead, found by search: {', '.join(made)}")
+    assert found.trajectory.keyframes[-1] > 0
+    save_plan(found, tmp_path)
+    again = load_plan(tmp_path)
+    assert again.instead == found.instead
+    steps = split_moves(again.sequence, again.world)[0]
+    assert [s.move.makes.surface for s in steps] == made
+
+
 @pytest.mark.slow
 def test_a_box_too_high_for_the_demonstration_has_an_alternative(demo_sequence, coman):
     found = plan_or_replan(demo_sequence, coman, Scene.from_height(0.59))
