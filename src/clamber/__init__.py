@@ -61,6 +61,7 @@ _HOME = {
     "midway_of": "alternatives",
     "new_run_folder": "io",
     "plan": "pipeline",
+    "plan_cost": "alternatives",
     "plan_or_replan": "alternatives",
     "render_run": "viz",
     "replan": "alternatives",

@@ -59,6 +59,7 @@ from clamber.alternatives import Replanned as Replanned
 from clamber.alternatives import contact_alternatives as contact_alternatives
 from clamber.alternatives import contact_differences as contact_differences
 from clamber.alternatives import midway_of as midway_of
+from clamber.alternatives import plan_cost as plan_cost
 from clamber.alternatives import plan_or_replan as plan_or_replan
 from clamber.alternatives import replan as replan
 from clamber.alternatives import replan_rest as replan_rest
