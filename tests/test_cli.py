@@ -20,7 +20,8 @@ import clamber
 from clamber import cli
 
 COMMANDS = (
-    *("climb", "contacts", "plan", "simulate", "learn", "render", "export"),
+    *("climb", "contacts", "plan", "replan", "simulate", "learn"),
+    *("render", "export"),
     *("scene", "robot", "sweep"),
 )
 
@@ -86,6 +87,10 @@ def test_version_is_that_of_the_package(
         (["climb", "--robot", "nobody"], "--robot is 'nobody'; expected a robot.yaml"),
         (["climb", "--scene", "no.yaml"], "no.yaml expected a readable file"),
         (["climb", "--scene", "a.yaml", "--height", "1"], "not both"),
+        (["replan"], "SEQUENCE"),
+        (["replan", "no.json"], "no.json expected a readable file"),
+        (["replan", "no", "--from", "3"], "no expected a run folder"),
+        (["climb", "--search.tries", "-1"], "--search.tries is -1; expected 0 or more"),
         (["scene", "no.yaml"], "no.yaml expected a readable file"),
         (["robot", "check", "nobody.urdf"], "expected a robot.yaml"),
         (["sweep", "no.yaml"], "no.yaml expected a readable file"),

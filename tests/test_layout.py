@@ -40,6 +40,7 @@ LAYERS = [
     "retiming",
     "trajectory",
     "pipeline",
+    "exploration",
     "control",
     "terrain",
     "adaptation",

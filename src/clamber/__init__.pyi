@@ -61,3 +61,15 @@ from clamber.trajectory import Trajectory as Trajectory
 from clamber.viz import render_run as render_run
 
 __version__: str
+from clamber.alternatives import Alternative as Alternative
+from clamber.alternatives import Ranked as Ranked
+from clamber.alternatives import Replanned as Replanned
+from clamber.alternatives import contact_alternatives as contact_alternatives
+from clamber.alternatives import contact_differences as contact_differences
+from clamber.alternatives import midway_of as midway_of
+from clamber.alternatives import plan_cost as plan_cost
+from clamber.alternatives import plan_or_replan as plan_or_replan
+from clamber.alternatives import replan as replan
+from clamber.alternatives import replan_rest as replan_rest
+from clamber.exploration import Bounds as Bounds
+from clamber.pipeline import Midway as Midway

@@ -190,6 +190,24 @@ class PlanningFlags:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SearchFlags:
+    """How far to look for contacts that nobody demonstrated."""
+
+    tries: int = _default("exploration", "Bounds", "tries")
+    """Steps that are planned at most; 0: no search."""
+    depth: int = _default("exploration", "Bounds", "depth")
+    """Moves of a sequence at most."""
+
+    def bounds(self) -> clamber.Bounds:
+        """The record."""
+        try:
+            return clamber.Bounds(tries=self.tries, depth=self.depth)
+        except InputError as e:
+            source = f"--{e.field}"
+            raise InputError(e.expected, source=source, value=e.value) from e
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExecutionFlags:
     """How to execute, and in which world."""
 
@@ -236,6 +254,10 @@ class ClimbCommand:
     """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
+    contacts: Literal["any", "demonstrated"] = "any"
+    """any: other contacts where the demonstrated ones have no stable plan."""
+    search: SearchFlags = field(default_factory=SearchFlags)
+    """How far to look for contacts that nobody demonstrated."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: bool = False
     """Draw a video too, not pictures alone."""
@@ -246,6 +268,7 @@ class ClimbCommand:
     def run(self) -> int:
         """Recording to verdict."""
         robot, scene = self.world.load()
+        bounds = None if self.contacts == "demonstrated" else self.search.bounds()
         clock = Clock()
         with self.output.progress() as show:
             report = clock.watching(show)
@@ -256,7 +279,9 @@ class ClimbCommand:
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():
-                plan = _plan(sequence, robot, scene, self.planning, folder, report)
+                plan = _plan(
+                    sequence, robot, scene, self.planning, folder, report, bounds
+                )
             done = self.execution.simulate(plan, folder, report, None)
             missing = ""
             try:
@@ -341,6 +366,111 @@ class PlanCommand:
         note = f"{_outcome(plan)}; the files are in {folder}"
         self.output.show(record, _keyframes(record), *_skipped(plan), note=note)
         return REACHED if plan.complete else MISSED
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplanCommand:
+    """Other contacts than the demonstrated ones, ranked, the best planned; or the rest.
+
+    With --from the rest of a run is planned from where the robot is.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE|RUN")]
+    """A sequence.json; with --from, the run folder whose plan was followed."""
+    begin: Annotated[
+        str | None,
+        tyro.conf.arg(
+            name="from",
+            metavar="STATE|SECONDS",
+            help_behavior_hint="(default: from standing)",
+        ),
+    ] = None
+    """Where the robot is: a state file, or a time of the run's rollout."""
+    world: Annotated[WorldFlags, Flat]
+    planning: Annotated[PlanningFlags, Flat]
+    search: SearchFlags = field(default_factory=SearchFlags)
+    """How far to look for contacts that nobody demonstrated."""
+    out: Place = None
+    """The run folder (runs/replan, then runs/replan-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Sequence to ranked plans, or run and state to the plan of the rest."""
+        return self._ranked() if self.begin is None else self._rest(self.begin)
+
+    def _ranked(self) -> int:
+        from clamber.alternatives import described
+        from clamber.io import save_replanned
+
+        sequence = clamber.load_sequence(self.source)
+        robot, scene = self.world.load()
+        bounds = self.search.bounds()
+        with self.output.progress() as report, self.world.blamed():
+            found = clamber.replan(
+                sequence,
+                robot,
+                scene,
+                options=clamber.PlanOptions(**asdict(self.planning)),
+                bounds=bounds,
+                progress=report,
+            )
+            folder = clamber.new_run_folder(self.out, "replan")
+            clamber.save_sequence(sequence, folder / "sequence.json")
+            clamber.save_plan(found.best.plan, folder)
+            save_replanned(found, folder)
+        if self.output.json:  # these two fields and no other
+            sys.stdout.write(json.dumps(_replanned_record(found)) + "\n")
+            return REACHED if found.best.stable else MISSED
+        table = _table("surfaces", "stable", "cost [m]", "moves", "why not")
+        for r in found.ranked:
+            table.add_row(
+                ", ".join(r.surfaces) or "as demonstrated",
+                "yes" if r.stable else "no",
+                f"{r.cost:.3f}",
+                str(len(r.plan.paths)),
+                "" if r.stable else _outcome(r.plan),
+            )
+        note = "the best one is planned" if found.best.stable else described(found)
+        self.output.show({}, table, note=f"{note}; the files are in {folder}")
+        return REACHED if found.best.stable else MISSED
+
+    def _rest(self, begin: str) -> int:
+        from clamber.io import load_state
+
+        made = clamber.load_plan(self.source)
+        if self.world.scene is None and self.world.height is None:
+            scene = made.world.scene
+        else:
+            scene = _scene(self.world.height, self.world.scene)
+        bounds = self.search.bounds()
+        q, touching = load_state(made, self.source, begin)
+        with self.output.progress() as report, self.world.blamed():
+            report("replan", 0.0, "")
+            now = clamber.midway_of(made, scene, q, touching, source=begin)
+            plan = clamber.replan_rest(made, now, scene, bounds=bounds, progress=report)
+            folder = clamber.new_run_folder(self.out, "replan")
+            clamber.save_sequence(plan.sequence, folder / "sequence.json")
+            clamber.save_plan(plan, folder)
+        record = {"out": str(folder), "made": now.made, **_plan_record(plan)}
+        on = ", ".join(f"{c.surface} on {c.support}" for c in now.contacts)
+        note = (
+            f"from {on}, {now.made} steps made: {_outcome(plan)}; the files are in"
+            f" {folder}"
+        )
+        tables = [_keyframes(record)] if plan.keyframes else []
+        self.output.show(record, *tables, *_skipped(plan), note=note)
+        return REACHED if plan.complete else MISSED
+
+
+def _replanned_record(found: clamber.Replanned) -> dict[str, Any]:
+    """Differences and plans, the best first."""
+    return {
+        "differences": [list(d) for d in found.differences],
+        "plans": [
+            {"surfaces": list(r.surfaces), "cost": r.cost, "stable": r.stable}
+            for r in found.ranked
+        ],
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -681,6 +811,7 @@ Command = (
     Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
+    | Annotated[ReplanCommand, tyro.conf.subcommand("replan")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
@@ -698,10 +829,17 @@ def _plan(
     flags: PlanningFlags,
     folder: Path,
     report: Report,
+    bounds: clamber.Bounds | None = None,
 ) -> clamber.Plan:
-    """Plan and save."""
+    """Plan and save; with bounds, other contacts where the demonstrated ones fail."""
     options = clamber.PlanOptions(**asdict(flags))
-    result = clamber.plan(sequence, robot, scene, options=options, progress=report)
+    world = (sequence, robot, scene)
+    if bounds is None:
+        result = clamber.plan(*world, options=options, progress=report)
+    else:
+        result = clamber.plan_or_replan(
+            *world, options=options, bounds=bounds, progress=report
+        )
     report("save", 0.0, "")
     clamber.save_plan(result, folder)
     report("save", 1.0, "")
@@ -791,6 +929,7 @@ def _plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, An
         )
     return {
         "complete": plan.complete,
+        "instead": plan.instead,
         "keyframes": keyframes,
         "skipped": [{"stance": s.stance, "reason": s.reason} for s in plan.skipped],
     }
@@ -823,7 +962,9 @@ def _keyframes(record: Mapping[str, Any]) -> Table:
 def _outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
-        return "planned to the last stance"
+        return "; ".join(filter(None, (plan.instead, "planned to the last stance")))
+    if plan.instead:
+        return f"the robot cannot do it: {plan.instead}"
     missed = [s.reason for s in plan.skipped if s.missed]
     why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
     return f"the robot cannot do it: {why}"
@@ -866,7 +1007,7 @@ def _conclude(
         **planned,
     }
     if reached:
-        note = "the robot made it"
+        note = "; ".join(filter(None, (plan.instead, "the robot made it")))
     elif not plan.complete:
         note = _outcome(plan)
     elif rollout is not None and rollout.stopped:

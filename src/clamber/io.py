@@ -29,6 +29,7 @@ import numpy as np
 import pydantic
 
 import clamber.model
+from clamber.alternatives import Replanned
 from clamber.contact import (
     Contact,
     ContactInterval,
@@ -39,11 +40,11 @@ from clamber.contact import (
 from clamber.errors import InputError, Status
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
-from clamber.pipeline import Plan, PlanOptions, Skipped
+from clamber.pipeline import Midway, Plan, PlanOptions, Skipped
 from clamber.policy import DemoPolicy, GeneralPolicy, Option, PelvisDistribution, Place
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
-from clamber.scene import Box, Scene, input_error
+from clamber.scene import Box, Scene, input_error, read_yaml
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
 from clamber.statics import Phase, StaticEquilibrium
@@ -60,6 +61,7 @@ TIMINGS = "timings.json"
 ROLLOUT = "rollout.npz"
 VERDICT = "verdict.json"
 EXECUTION = "execution.json"
+REPLANNED = "replan.json"
 PLANNED_SCENE = "planned.xml"  # where physics ran another world than was planned for
 PLANNED_TRAJECTORY = "planned.npz"  # where another one was followed in the end
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
@@ -71,6 +73,7 @@ _OF_AN_EARLIER_PLAN = (
     EXECUTION,
     PLANNED_SCENE,
     PLANNED_TRAJECTORY,
+    REPLANNED,
 )
 _NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped", "rests_on"}
 _UNREADABLE = (
@@ -702,6 +705,22 @@ class _SkippedFile(pydantic.BaseModel):
     missed: bool = False
 
 
+class _MidwayFile(pydantic.BaseModel):
+    made: int = pydantic.Field(ge=0)
+    qpos: list[float]
+    contacts: list[_ContactFile]
+    loaded: list[str]
+
+    def midway(self) -> Midway:
+        contacts = tuple(c.contact() for c in self.contacts)
+        return Midway(
+            made=self.made,
+            contacts=contacts,
+            loaded=tuple(c for c in contacts if c.surface in self.loaded),
+            q=np.array(self.qpos),
+        )
+
+
 class _PlanFile(pydantic.BaseModel):
     options: dict[str, Any]
     robot: RobotFile
@@ -709,6 +728,8 @@ class _PlanFile(pydantic.BaseModel):
     keyframes: list[_KeyframeFile] = pydantic.Field(min_length=1)
     skipped: list[_SkippedFile]
     complete: bool
+    midway: _MidwayFile | None = None
+    instead: str = ""
 
 
 class _TimingsFile(pydantic.BaseModel):
@@ -761,7 +782,20 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "skipped": [asdict(s) for s in plan.skipped],
         "sequence": sequence_fields(plan.sequence)
         | {"scene": scene_fields(world.scene)},
-    }
+    } | _other_plan_fields(plan)
+
+
+def _other_plan_fields(plan: Plan) -> dict[str, Any]:
+    """What a plan has that is not of a whole climb as demonstrated."""
+    out: dict[str, Any] = {"instead": plan.instead} if plan.instead else {}
+    if plan.midway is not None:
+        out["midway"] = {
+            "made": plan.midway.made,
+            "qpos": plan.midway.q,
+            "contacts": [contact_fields(c) for c in plan.midway.contacts],
+            "loaded": [c.surface for c in plan.midway.loaded],
+        }
+    return out
 
 
 def _robot_fields(robot: Robot) -> dict[str, Any]:
@@ -894,6 +928,13 @@ def load_plan(folder: str | Path) -> Plan:
     scene, followed = _planned(folder)
     world = _load_world(scene, _robot(file.robot), sequence.scene)
     nq = world.model.nq
+    if file.midway is not None and len(file.midway.qpos) != nq:
+        raise InputError(
+            f"{nq} numbers, as many as {SCENE} has coordinates",
+            source=path,
+            field="midway.qpos",
+            value=f"{len(file.midway.qpos)} numbers",
+        )
     for i, k in enumerate(file.keyframes):
         if len(k.qpos) != nq:
             raise InputError(
@@ -927,6 +968,8 @@ def load_plan(folder: str | Path) -> Plan:
         trajectory=trajectory,
         complete=file.complete,
         timings=timings,
+        midway=None if file.midway is None else file.midway.midway(),
+        instead=file.instead,
     )
 
 
@@ -1043,6 +1086,102 @@ def save_timings(folder: str | Path, seconds: Mapping[str, float]) -> None:
 
 def _sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+# Other contacts, and where a robot is.
+
+
+def save_replanned(found: Replanned, folder: str | Path) -> None:
+    """Write `replan.json`: what was tried, the best first, and what the search did."""
+    e = found.explored
+    _write_json(
+        Path(folder) / REPLANNED,
+        {
+            "differences": found.differences,
+            "plans": [
+                {
+                    "surfaces": r.surfaces,
+                    "cost": r.cost,
+                    "stable": r.stable,
+                    "moves": [str(p.transition.move) for p in r.plan.paths],
+                    "missed": [s.reason for s in r.plan.skipped if s.missed],
+                }
+                for r in found.ranked
+            ],
+            "search": None
+            if e is None
+            else {"states": e.states, "tries": e.tries, "stop": e.stop.value},
+        },
+    )
+
+
+class _StateOnDisk(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid")
+    version: int = VERSION
+    position: Vector
+    quaternion: Quaternion
+    joints: dict[str, float]
+    contacts: dict[str, str] | None = None
+
+
+def load_state(
+    plan: Plan, folder: str | Path, where: str
+) -> tuple[np.ndarray, dict[str, str] | None]:
+    """Posture (nq,) and the support of each surface in contact, None if not said.
+
+    Args:
+        plan: That the robot was following.
+        folder: Its run.
+        where: A state file (YAML or JSON: `position` and `quaternion` of the base,
+            `joints` by name, `contacts` as supports by surface), or a time of the run's
+            rollout [s].
+
+    Raises:
+        InputError: The file or one of its fields cannot be used, or nothing was
+            recorded at that time.
+    """
+    try:
+        seconds = float(where)
+    except ValueError:
+        return _state_of(plan.world, Path(where))
+    rollout = load_rollout(folder)
+    if not 0.0 <= seconds <= rollout.time[-1]:
+        raise InputError(
+            f"a time of the rollout, 0 to {rollout.time[-1]:g} s",
+            source="--from",
+            value=seconds,
+        )
+    return rollout.qpos[int(np.searchsorted(rollout.time, seconds))], None
+
+
+def _state_of(world: World, path: Path) -> tuple[np.ndarray, dict[str, str] | None]:
+    try:
+        state = _StateOnDisk.model_validate(read_yaml(path))
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    numbers = (*state.position, *state.quaternion, *state.joints.values())
+    if not np.all(np.isfinite(numbers)):
+        raise InputError("finite numbers only", source=path)
+    size = float(np.linalg.norm(state.quaternion))
+    if abs(size - 1.0) > 0.01:
+        raise InputError(
+            "a unit quaternion, w first",
+            source=path,
+            field="quaternion",
+            value=state.quaternion,
+        )
+    for name in (*state.joints, *world.joints):
+        if (name in state.joints) != (name in world.joints):
+            raise InputError(
+                f"the joints of {world.robot.name}: {', '.join(world.joints)}",
+                source=path,
+                field=f"joints.{name}",
+                value=state.joints.get(name, "missing"),
+            )
+    q = world.home.copy()
+    q[:3], q[3:7] = state.position, np.array(state.quaternion) / size
+    q[world.qadr] = [state.joints[n] for n in world.joints]
+    return q, state.contacts
 
 
 # Rollouts and verdicts.
