@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,10 +11,17 @@ import pytest
 from clamber import exploration
 from clamber.contact import region_of
 from clamber.errors import InputError
-from clamber.exploration import Bounds, Stop, action_counts, explore
+from clamber.exploration import (
+    Bounds,
+    Stop,
+    action_counts,
+    explore,
+    policy_counts,
+)
 from clamber.model import build_world
 from clamber.moves import split_moves
 from clamber.pipeline import PlanOptions
+from clamber.policy import DemoPolicy
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import contact_drift
 from clamber.scaling import retarget
@@ -57,6 +65,19 @@ def test_actions_are_counted_in_the_regions_in_which_they_are_taken(goal, ik):
         ("M", "LKnee"): 1,
         ("M", "RKnee"): 1,
     }
+
+
+def test_a_policy_counts_the_actions_of_all_its_demonstrations(goal):
+    on = goal.stances[-1]
+    table = DemoPolicy(
+        source="one",
+        scene=goal.scene,
+        subject={},
+        states=(on,) * 5,
+        actions=("LKnee", None, "LKnee", "RElbow"),
+    )
+    policy = SimpleNamespace(demos=(table, table))
+    assert policy_counts(policy) == {("O", "LKnee"): 4, ("O", "RElbow"): 2}
 
 
 @pytest.fixture(scope="module")

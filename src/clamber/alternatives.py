@@ -332,6 +332,7 @@ def plan_or_replan(
     *,
     options: PlanOptions | None = None,
     bounds: Bounds | None = None,
+    counts: Counts | None = None,
     progress: Progress | None = None,
 ) -> Plan:
     """The demonstrated contacts; where they have no stable plan, the best others.
@@ -347,7 +348,13 @@ def plan_or_replan(
     if first.complete or not why:
         return first
     found = replan(
-        sequence, robot, scene, options=options, bounds=bounds, progress=progress
+        sequence,
+        robot,
+        scene,
+        options=options,
+        bounds=bounds,
+        counts=counts,
+        progress=progress,
     )
     if not found.best.stable:
         return replace(first, instead=f"{why}; {described(found)}")

@@ -197,14 +197,29 @@ class SearchFlags:
     """Steps that are planned at most; 0: no search."""
     depth: int = _default("exploration", "Bounds", "depth")
     """Moves of a sequence at most."""
+    policy: Annotated[
+        Path | None,
+        tyro.conf.arg(help_behavior_hint="(default: the sequence's own)"),
+    ] = None
+    """policy.json whose demonstrations say which contacts are tried first."""
 
-    def bounds(self) -> clamber.Bounds:
-        """The record."""
+    def read(self) -> dict[str, Any]:
+        """The arguments of the functions that search."""
+        return {"bounds": self._bounds(), "counts": self._counts()}
+
+    def _bounds(self) -> clamber.Bounds:
         try:
             return clamber.Bounds(tries=self.tries, depth=self.depth)
         except InputError as e:
             source = f"--{e.field}"
             raise InputError(e.expected, source=source, value=e.value) from e
+
+    def _counts(self) -> Any:
+        from clamber.exploration import policy_counts
+
+        if self.policy is None:
+            return None
+        return policy_counts(clamber.load_policy(self.policy))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +283,7 @@ class ClimbCommand:
     def run(self) -> int:
         """Recording to verdict."""
         robot, scene = self.world.load()
-        bounds = None if self.contacts == "demonstrated" else self.search.bounds()
+        others = None if self.contacts == "demonstrated" else self.search.read()
         clock = Clock()
         with self.output.progress() as show:
             report = clock.watching(show)
@@ -280,7 +295,7 @@ class ClimbCommand:
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():
                 plan = _plan(
-                    sequence, robot, scene, self.planning, folder, report, bounds
+                    sequence, robot, scene, self.planning, folder, report, others
                 )
             done = self.execution.simulate(plan, folder, report, None)
             missing = ""
@@ -404,14 +419,14 @@ class ReplanCommand:
 
         sequence = clamber.load_sequence(self.source)
         robot, scene = self.world.load()
-        bounds = self.search.bounds()
+        others = self.search.read()
         with self.output.progress() as report, self.world.blamed():
             found = clamber.replan(
                 sequence,
                 robot,
                 scene,
                 options=clamber.PlanOptions(**asdict(self.planning)),
-                bounds=bounds,
+                **others,
                 progress=report,
             )
             folder = clamber.new_run_folder(self.out, "replan")
@@ -442,12 +457,12 @@ class ReplanCommand:
             scene = made.world.scene
         else:
             scene = _scene(self.world.height, self.world.scene)
-        bounds = self.search.bounds()
+        others = self.search.read()
         q, touching = load_state(made, self.source, begin)
         with self.output.progress() as report, self.world.blamed():
             report("replan", 0.0, "")
             now = clamber.midway_of(made, scene, q, touching, source=begin)
-            plan = clamber.replan_rest(made, now, scene, bounds=bounds, progress=report)
+            plan = clamber.replan_rest(made, now, scene, **others, progress=report)
             folder = clamber.new_run_folder(self.out, "replan")
             clamber.save_sequence(plan.sequence, folder / "sequence.json")
             clamber.save_plan(plan, folder)
@@ -829,16 +844,19 @@ def _plan(
     flags: PlanningFlags,
     folder: Path,
     report: Report,
-    bounds: clamber.Bounds | None = None,
+    others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
-    """Plan and save; with bounds, other contacts where the demonstrated ones fail."""
+    """Plan and save; `others`: how others are looked for where the shown ones fail."""
     options = clamber.PlanOptions(**asdict(flags))
     world = (sequence, robot, scene)
-    if bounds is None:
+    if others is None:
         result = clamber.plan(*world, options=options, progress=report)
     else:
         result = clamber.plan_or_replan(
-            *world, options=options, bounds=bounds, progress=report
+            *world,
+            options=options,
+            **others,
+            progress=report,
         )
     report("save", 0.0, "")
     clamber.save_plan(result, folder)

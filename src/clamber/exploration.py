@@ -31,6 +31,7 @@ from clamber.model import Kinematics, World
 from clamber.moves import Move, Step, split_moves
 from clamber.path import Path
 from clamber.pipeline import PlanOptions, Progress
+from clamber.policy import GeneralPolicy
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe
 from clamber.scaling import near_edge
@@ -105,6 +106,16 @@ class Explored:
     states: int
     tries: int
     stop: Stop
+
+
+def policy_counts(policy: GeneralPolicy) -> Counts:
+    """How often the demonstrations of a policy take each action in each region."""
+    return Counter(
+        (state.region, action)
+        for demo in policy.demos
+        for state, action in zip(demo.states, demo.actions, strict=False)
+        if action is not None
+    )
 
 
 def action_counts(sequence: ContactSequence, world: World) -> Counts:
