@@ -1,3 +1,5 @@
+from clamber.checkup import Checkup as Checkup
+from clamber.checkup import check_robot as check_robot
 from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
@@ -23,6 +25,7 @@ from clamber.io import load_plan as load_plan
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
+from clamber.io import save_proposal as save_proposal
 from clamber.io import save_rollout as save_rollout
 from clamber.io import save_sequence as save_sequence
 from clamber.io import save_verdict as save_verdict
@@ -38,6 +41,8 @@ from clamber.model import load_robot as load_robot
 from clamber.pipeline import Plan as Plan
 from clamber.pipeline import PlanOptions as PlanOptions
 from clamber.pipeline import plan as plan
+from clamber.proposal import Proposal as Proposal
+from clamber.proposal import propose_robot as propose_robot
 from clamber.scene import Box as Box
 from clamber.scene import Scene as Scene
 from clamber.scene import Support as Support
@@ -50,6 +55,7 @@ from clamber.simulation import simulate as simulate
 from clamber.sweep import load_sweep as load_sweep
 from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
+from clamber.viz import draw_robot as draw_robot
 from clamber.viz import render_run as render_run
 
 __version__: str

@@ -36,6 +36,7 @@ from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, Wor
 from clamber.pipeline import Plan, PlanOptions, Skipped
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
+from clamber.proposal import Proposal, robot_yaml
 from clamber.scene import Box, Scene, input_error
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
@@ -47,6 +48,7 @@ SEQUENCE = "sequence.json"
 PLAN = "plan.json"
 TRAJECTORY = "trajectory.npz"
 SCENE = "scene.xml"
+ROBOT = "robot.yaml"
 ASSETS = "assets"
 TIMINGS = "timings.json"
 ROLLOUT = "rollout.npz"
@@ -629,6 +631,7 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
             for n, x in robot.limbs.items()
         },
         "surfaces": robot.prefixes,
+        "effort": robot.effort,
         "gains": {
             n: dict(zip(("kp", "kd", "ki"), g, strict=True))
             for n, g in robot.gains.items()
@@ -718,6 +721,16 @@ def _with_assets(world: World, folder: Path) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
+def save_proposal(proposal: Proposal, folder: str | Path) -> None:
+    """Write `robot.yaml` and the model that it names into a folder."""
+    for name, text in (
+        (proposal.fields["model"], proposal.mjcf),
+        (ROBOT, robot_yaml(proposal)),
+    ):
+        with _whole(Path(folder) / name) as stream:
+            stream.write(text.encode())
+
+
 def load_plan(folder: str | Path) -> Plan:
     """Read what `save_plan` wrote, all but the paths.
 
@@ -802,6 +815,7 @@ def _robot(file: RobotFile) -> Robot:
             if (x := file.limbs.get(n))
         },
         prefixes=file.surfaces,
+        effort=file.effort,
         gains={n: (g.kp, g.kd, g.ki) for n, g in file.gains.items()},
         impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
         self_positioning=tuple(file.self_positioning),

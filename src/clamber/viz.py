@@ -31,7 +31,7 @@ from clamber.contact import Contact, ContactSequence
 from clamber.demo import Demonstration
 from clamber.errors import ClamberError
 from clamber.io import ROLLOUT, load_plan, load_rollout, whole_file
-from clamber.model import Kinematics, Robot, World
+from clamber.model import Kinematics, Robot, World, build_world
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
 from clamber.scene import GROUND, Scene, Support
@@ -298,6 +298,39 @@ def near_edge_points(scene: Scene) -> np.ndarray:
 
 
 # Sheets of pictures.
+
+
+def draw_robot(
+    robot: Robot, path: str | Path, *, tile: tuple[int, int] = (560, 640)
+) -> Path:
+    """Draw the robot as it stands, from behind and from ahead, its surfaces named.
+
+    A dot marks where each surface touches, a ring the mass that its limb supports.
+    """
+    world = build_world(robot, Scene(start=np.zeros(3)))
+    kin = Kinematics(world)
+    kin.update(world.home)
+    corners, up = robot_corners(kin), np.array([0.0, 0.0, 1.0])
+    fovy = float(world.model.vis.global_.fovy)
+    tiles = []
+    with Camera(world, tile) as camera:
+        for caption, turn in (("from behind", 0.0), ("from ahead", 2.4)):
+            view = frame_view(corners, tile[0] / tile[1], yaw=turn, fovy=fovy)
+            picture = camera.shot(world.home, view)
+            draw = ImageDraw.Draw(picture)
+            for limb in world.robot.limbs.values():
+                x, y = view.project(kin.landmark(limb.root)[1], tile)
+                draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline=DARK, width=2)
+                for surface, colour in zip(
+                    limb.surfaces, SURFACE_COLOURS, strict=False
+                ):
+                    at = view.project(kin.contact_point(surface, up), tile)
+                    _dot(draw, at, 5, colour)
+                    draw.text(
+                        (at[0] + 8, at[1] - 8), surface, font=_font(15), fill=DARK
+                    )
+            tiles.append((picture, [f"{world.robot.name}, {caption}"]))
+    return _save_sheet(tiles, path, columns=2)
 
 
 def keyframe_sheet(
