@@ -254,7 +254,7 @@ def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEqui
         kin.com.copy(),
         kin.world.mass,
         names=names,
-        torque=_torque_limits(kin, names, points),
+        torque=torque_limits(kin, names, points),
     )
 
 
@@ -264,15 +264,23 @@ def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
     What `equilibrium_at` says without a margin, at a hundredth of the cost.
     """
     names, points, normals, mu = bearing_frames(kin, contacts)
-    torque = _torque_limits(kin, names, points)
+    torque = torque_limits(kin, names, points)
     com, mass = kin.com.copy(), kin.world.mass
     found = contact_forces(points, normals, mu, com, mass, torque=torque)
     return found.residual <= BALANCE_TOL
 
 
-def _torque_limits(
-    kin: Kinematics, names: Sequence[str], points: np.ndarray
+def torque_limits(
+    kin: Kinematics, names: Sequence[str], points: np.ndarray, share: float = 1.0
 ) -> TorqueLimits:
+    """What the joints can bear with forces at bearing points, a share of their limits.
+
+    Args:
+        kin: At the posture.
+        names: Surface of each point.
+        points: (n, 3) in the world.
+        share: Of the effort limits.
+    """
     w = kin.world
     J = np.concatenate(
         [
@@ -284,7 +292,7 @@ def _torque_limits(
         jacobian=J,
         gravity=kin.gravity(),
         dofs=w.dadr,
-        limits=w.tau_max,
+        limits=share * w.tau_max,
         names=w.joints,
     )
 
