@@ -57,6 +57,7 @@ WEAK = 0.15  # share of the largest effort: weaker joints have a light drive
 WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
 MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
 COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
+HAND_SHARE = 0.25  # of the weight, that a hand bears for ankles to position themselves
 GUESSED_EFFORT = {"leg": 0.8, "trunk": 0.6, "arm": 0.25}  # of weight times thigh
 _EFFORTS = pydantic.TypeAdapter(dict[str, Annotated[float, pydantic.Field(gt=0)]])
 
@@ -144,6 +145,19 @@ def propose_robot(
             + ", ".join(f"{a} and {b}" for a, b in overlaps)
         )
     gains, drives, impedance = _gains(model, data, found, effort)
+    bears = _hand_load(model, data, found, shapes, effort)
+    ankles = []
+    if bears >= HAND_SHARE * float(model.body_subtreemass[found.base]) * 9.81:
+        ankles = [
+            model.joint(j).name
+            for n in ("left_leg", "right_leg")
+            for j in found.limbs[n].joints[found.limbs[n].bend + 1 :]
+        ]
+    else:
+        notes.append(
+            f"across its wrists a hand bears {bears:.0f} N: too little for ankles to"
+            " give way, so none positions itself"
+        )
     name = _plain(path.stem)
     fields = {
         "version": 1,
@@ -156,11 +170,7 @@ def propose_robot(
         "effort": effort,
         "gains": gains,
         "impedance": impedance,
-        "self_positioning": [
-            model.joint(j).name
-            for n in ("left_leg", "right_leg")
-            for j in found.limbs[n].joints[found.limbs[n].bend + 1 :]
-        ],
+        "self_positioning": ankles,
     }
     return Proposal(
         name=name,
@@ -758,6 +768,28 @@ def effort_of(model: mujoco.MjModel, joint: int) -> float | None:
                 )
     found = [x for x in found if x > 0]
     return min(found) if found else None
+
+
+def _hand_load(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    found: Anatomy,
+    shapes: list[Shape],
+    effort: dict[str, float],
+) -> float:
+    """What each hand bears whichever way it is turned about its wrists [N]."""
+    balls = {s.name: s for s in shapes if s.surface}
+    out = np.inf
+    for name, chain in found.limbs.items():
+        if not name.endswith("arm"):
+            continue
+        ball = balls[f"{name[0].upper()}Hand"]
+        p = data.xpos[ball.link] + data.xmat[ball.link].reshape(3, 3) @ ball.position
+        for j in chain.joints[chain.bend + 1 :]:
+            arm = np.cross(data.xaxis[j], p - data.xanchor[j])
+            lever = max(float(np.linalg.norm(arm)), ball.size[0])
+            out = min(out, effort[model.joint(j).name] / lever)
+    return float(out)
 
 
 def _two_digits(x: float) -> float:
