@@ -279,7 +279,7 @@ def _chain(
     beyond = tuple(
         j
         for b in range(1, model.nbody)
-        if _hangs_on(model, b, way[0])
+        if hangs_on(model, b, way[0])
         for j in _joints_of(model, b)
         if j not in mine
     )
@@ -294,7 +294,8 @@ def _chain(
     )
 
 
-def _hangs_on(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
+def hangs_on(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
+    """Whether a body is another, or hangs on it."""
     while body:
         if body == ancestor:
             return True
@@ -378,7 +379,7 @@ def link_points(
         g
         for g in range(model.ngeom)
         if links[model.geom_bodyid[g]] == body
-        or (below and _hangs_on(model, int(model.geom_bodyid[g]), body))
+        or (below and hangs_on(model, int(model.geom_bodyid[g]), body))
     ]
     solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
     points = [geom_points(model, data, g) for g in solid or geoms]

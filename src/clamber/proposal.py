@@ -1,14 +1,15 @@
 """A description -> a proposal of a robot: `robot.yaml` and a model of plain shapes.
 
 Links keep their frames, masses, inertias and joints. Their collision shapes stay where
-they are spheres, capsules, cylinders, boxes; meshes become the capsule or box around
-them. Surfaces are added where a person rests on: a ball at the end of each hand, at
-each elbow and knee, standing out a little; under each foot the largest rectangle of its
-sole. Everything is to be looked at, and corrected, by the user.
+they are spheres, capsules, cylinders, boxes; a mesh becomes a capsule as long as it and
+of its volume, or a box. Surfaces are added where a person rests on: a ball at the end
+of each hand, at each elbow and knee, standing out a little; under each foot the largest
+rectangle of its sole. Everything is to be looked at, and corrected, by the user.
 """
 
 from __future__ import annotations
 
+import contextlib
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ import mujoco
 import numpy as np
 import pydantic
 import yaml
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 from scipy.spatial import ConvexHull, QhullError
 
 from clamber.anatomy import (
@@ -28,11 +29,17 @@ from clamber.anatomy import (
     Chain,
     anatomy,
     geom_points,
+    hangs_on,
     joint_range,
     link_points,
     links_of,
 )
-from clamber.description import Description, compile_description, read_description
+from clamber.description import (
+    MESHES,
+    Description,
+    compile_description,
+    read_description,
+)
 from clamber.errors import InputError
 from clamber.scene import input_error, read_yaml
 from clamber.se3 import matrix_from_quat, quat_from_matrix, rotation_vector
@@ -40,8 +47,10 @@ from clamber.se3 import matrix_from_quat, quat_from_matrix, rotation_vector
 HEAVY = 1.0  # [kg] a link this heavy without collision shape gets one
 PAD = 0.006  # [m] balls stand out of their links: the link does not touch before them
 FLAT = 0.4  # a mesh flatter than this share of its width becomes a box
-COVERED = 0.95  # share of a mesh's vertices within the radius of its capsule
 SOLE_DEPTH = 0.04  # share of the shank: points this near to the lowest are the sole
+NEAR = 0.05  # share of thigh or upper arm: as far past the joint its ball holds all
+LEAST_BALL, LARGEST_BALL = 0.12, 0.3  # ... radius at knee and elbow
+TOUCHING = 0.02  # [m] links two joints apart that are nearer are not kept apart
 KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
@@ -141,7 +150,7 @@ def propose_robot(
     overlaps = _overlaps(model, found, shapes, home)
     if overlaps:
         notes.append(
-            "links that overlap in the nominal posture may go through each other: "
+            "links that overlap, or nearly, in the nominal posture are not kept apart: "
             + ", ".join(f"{a} and {b}" for a, b in overlaps)
         )
     gains, drives, impedance = _gains(model, data, found, effort)
@@ -377,14 +386,16 @@ def _shape(
 
 
 def _around(name: str, link: int, points: np.ndarray, data: mujoco.MjData) -> Shape:
-    """The capsule, or for what is flat the box, around points (K, 3) in the world."""
-    try:
-        points = points[ConvexHull(points).vertices]
-    except QhullError:
-        pass
+    """The capsule as long as the hull of points (K, 3) and of its volume.
+
+    What is flat becomes the box around it instead, along the same principal axes.
+    """
+    volume = np.inf
+    with contextlib.suppress(QhullError):
+        hull = ConvexHull(points)
+        points, volume = points[hull.vertices], float(hull.volume)
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
-    axes = axes if np.linalg.det(axes) > 0 else -axes
     local = (points - middle) @ axes.T
     low, high = local.min(axis=0), local.max(axis=0)
     half = np.maximum((high - low) / 2, 1e-3)
@@ -396,13 +407,15 @@ def _around(name: str, link: int, points: np.ndarray, data: mujoco.MjData) -> Sh
     if c < FLAT * b:
         p, R = _in_link(data, link, centre, R)
         return _shape(name, link, "box", (a, b, c), p, R)
-    across = (points - centre) @ R[:, 1:]
-    radius = float(np.quantile(np.linalg.norm(across, axis=1), COVERED))
+    # Half length a and radius r hold pi r^2 (2 (a - r) + 4/3 r), growing up to r = a.
+    r = float(np.sqrt(b * c))
+    if np.isfinite(volume) and volume < 4 / 3 * np.pi * a**3:
+        r = brentq(lambda r: np.pi * r**2 * (2 * a - 2 / 3 * r) - volume, 0.0, a)
     R = np.stack([R[:, 1], R[:, 2], R[:, 0]], axis=1)
     p, R = _in_link(data, link, centre, R)
-    if a - radius < 1e-3:
-        return _shape(name, link, "sphere", (max(a, radius),), p, R)
-    return _shape(name, link, "capsule", (radius, a - radius), p, R)
+    if a - r < 1e-3:
+        return _shape(name, link, "sphere", (r,), p, R)
+    return _shape(name, link, "capsule", (r, a - r), p, R)
 
 
 def _of_inertia(
@@ -432,12 +445,12 @@ def _with_surfaces(
         middle, end = int(links[chain.middle]), int(links[chain.end])
         if name.endswith("arm"):
             outer, inner = f"{side}Hand", f"{side}Elbow"
-            own = [_hand(outer, model, data, chain)]
+            own = [_hand(outer, model, data, chain, shapes)]
         else:
             outer, inner = f"{side}Foot", f"{side}Knee"
             own = [_sole(outer, model, data, chain, source)]
             shapes = [s for s in shapes if s.link != end]
-        own.append(_joint_ball(inner, model, data, chain, forward=found.forward))
+        own.append(_joint_ball(inner, model, data, chain, shapes))
         prefix = {end: outer, middle: inner}
         shapes = [
             s
@@ -462,11 +475,48 @@ def _with_surfaces(
     return shapes, {n: limbs[n] for n in order}
 
 
-def _hand(name: str, model: mujoco.MjModel, data: mujoco.MjData, chain: Chain) -> Shape:
+def _points_of(
+    shapes: Sequence[Shape], links: Sequence[int], data: mujoco.MjData
+) -> np.ndarray:
+    """(K, 3) points in the world on the shapes of links."""
+    spec = mujoco.MjSpec()
+    for s in shapes:
+        if s.link in links:
+            R_WL = data.xmat[s.link].reshape(3, 3)
+            spec.worldbody.add_geom(
+                type=_KINDS[s.kind],
+                size=[*s.size, 0, 0][:3],
+                pos=data.xpos[s.link] + R_WL @ s.position,
+                quat=quat_from_matrix(R_WL @ matrix_from_quat(s.quaternion)),
+            )
+    model = spec.compile()
+    alone = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, alone)
+    points = [geom_points(model, alone, g) for g in range(model.ngeom)]
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+_KINDS = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+}
+
+
+def _hand(
+    name: str,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    chain: Chain,
+    shapes: Sequence[Shape],
+) -> Shape:
     """A ball at the far end of the hand, fingers and all."""
     links = links_of(model)
     end, elbow = int(links[chain.end]), data.xanchor[chain.joints[chain.bend]]
-    points = link_points(model, data, end, below=True)
+    hand = [b for b in set(links.tolist()) if hangs_on(model, b, end)]
+    points = _points_of(shapes, hand, data)
     if len(points) == 0:
         points = data.xipos[end][None]
     away = np.linalg.norm(points - elbow, axis=1)
@@ -490,25 +540,23 @@ def _joint_ball(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     chain: Chain,
-    forward: np.ndarray,
+    shapes: Sequence[Shape],
 ) -> Shape:
-    """A ball around knee or elbow, as large as its link there on the outer side."""
-    links = links_of(model)
-    link, joint = int(links[chain.middle]), chain.joints[chain.bend]
-    anchor, axis = data.xanchor[joint], data.xaxis[joint]
-    points = link_points(model, data, link)
+    """A ball around knee or elbow that holds all of its link on the near side."""
+    link = int(links_of(model)[chain.middle])
+    anchor = data.xanchor[chain.joints[chain.bend]]
+    axis = data.xaxis[chain.joints[chain.bend]]
+    points = _points_of(shapes, [link], data)
     length = float(np.linalg.norm(data.xpos[chain.root] - anchor))
-    # Out is where the limb's far part does not go when it folds.
-    fold = chain.sign * np.cross(axis, _far(model, data, chain) - anchor)
-    out = -fold / max(float(np.linalg.norm(fold)), 1e-9)
-    near = points[np.linalg.norm(points - anchor, axis=1) < 0.4 * length]
-    middle = np.zeros(3)
-    radius = 0.15 * length
+    on = _far(model, data, chain) - anchor
+    on /= max(float(np.linalg.norm(on)), 1e-9)
+    near = points[(points - anchor) @ on < NEAR * length]
+    middle, radius = np.zeros(3), LEAST_BALL * length
     if len(near):
         aside = (near - anchor) @ axis
         middle = 0.5 * (aside.max() + aside.min()) * axis
-        radius = float(((near - anchor) @ out).max())
-    radius = float(np.clip(radius, 0.12 * length, 0.3 * length))
+        radius = float(np.linalg.norm(near - anchor - middle, axis=1).max())
+    radius = float(np.clip(radius, LEAST_BALL * length, LARGEST_BALL * length))
     p, _ = _in_link(data, link, anchor + middle, np.eye(3))
     return _shape(name, link, "sphere", (radius + PAD,), p, np.eye(3), surface=True)
 
@@ -536,7 +584,7 @@ def _sole(
     points = link_points(model, data, end, below=True)
     if len(points) < 4:
         raise InputError(
-            "collision or visual geometry: its sole is not known without",
+            f"geometry that MuJoCo loads ({', '.join(MESHES)}), for its sole",
             source=source,
             field=f"body {model.body(end).name!r}",
         )
@@ -858,22 +906,28 @@ def _gains(
 def _overlaps(
     model: mujoco.MjModel, found: Anatomy, shapes: list[Shape], home: dict[str, float]
 ) -> list[tuple[str, str]]:
-    """Names of links that overlap in the nominal posture, neighbours aside."""
+    """Names of links that overlap in the nominal posture, neighbours aside.
+
+    Links two joints apart, as in a hip, count when they are nearer than `TOUCHING`:
+    they are built around each other, and the shapes stand for more than is there.
+    """
     text = _mjcf("trial", model, found, shapes, [], {})
     trial = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(trial)
     for name, angle in home.items():
         data.qpos[trial.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(trial, data)
+    parent = trial.body_parentid
     out, fromto = set(), np.zeros(6)
     for a in range(trial.ngeom):
         for b in range(a + 1, trial.ngeom):
-            i, j = int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])
-            near = i == j or trial.body_parentid[i] == j or trial.body_parentid[j] == i
-            if near or (i, j) in out:
+            i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
+            if i == j or parent[j] == i or (i, j) in out:
                 continue
-            if mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto) <= 0:
-                out.add((min(i, j), max(i, j)))
+            close = parent[parent[j]] == i or parent[i] == parent[j]
+            room = TOUCHING if close else 0.0
+            if mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto) <= room:
+                out.add((i, j))
     return [(trial.body(i).name, trial.body(j).name) for i, j in sorted(out)]
 
 
