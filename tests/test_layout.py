@@ -22,9 +22,10 @@ SOURCE = ROOT / "src" / "clamber"
 LAYERS = [
     "errors",
     "se3",
+    "description",
+    "boxes",
     "scene",
     "contact",
-    "description",
     "model",
     "anatomy",
     "proposal",

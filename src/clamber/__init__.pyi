@@ -1,5 +1,6 @@
 from clamber.checkup import Checkup as Checkup
 from clamber.checkup import check_robot as check_robot
+from clamber.checkup import check_scene as check_scene
 from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
@@ -56,6 +57,7 @@ from clamber.sweep import load_sweep as load_sweep
 from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
 from clamber.viz import draw_robot as draw_robot
+from clamber.viz import draw_scene as draw_scene
 from clamber.viz import render_run as render_run
 
 __version__: str

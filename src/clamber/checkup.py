@@ -1,4 +1,4 @@
-"""Robot -> what a planner sees of it, and what is wrong with it."""
+"""Robot or scene -> what a planner sees of it, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clamber.model import Kinematics, Robot, World, build_world, limb_lengths
 from clamber.pipeline import check_start
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import KeyframeOptions
-from clamber.scene import Scene
+from clamber.scene import Box, Scene
 from clamber.search import standing
 
 LEVEL = np.radians(2.0)  # soles as the robot stands
@@ -187,3 +187,31 @@ def _volume(model: mujoco.MjModel, geom: int) -> float:
     if kind == kinds.mjGEOM_BOX:
         return float(8 * s.prod())
     return float(4 * model.geom_aabb[geom, 3:].prod())
+
+
+def check_scene(scene: Scene) -> dict[str, str]:
+    """What is wrong with each support, by name; those without a fault are left out.
+
+    A top steeper than its friction bears nothing, one below the ground is not there,
+    and one inside another box cannot be stood on.
+    """
+    out = {}
+    for s in scene.supports[1:]:
+        slope = float(np.arccos(np.clip(s.normal[2], -1.0, 1.0)))
+        corners = s.position + s.polygon @ s.rotation[:, :2].T
+        inside = [
+            b.name for b in scene.boxes if b.name != s.name and _holds(b, corners)
+        ]
+        if np.tan(slope) > s.friction:
+            out[s.name] = "steeper than its friction: it bears nothing"
+        elif corners[:, 2].max() <= 0:
+            out[s.name] = "below the ground"
+        elif inside:
+            out[s.name] = f"its top is inside {inside[0]}"
+    return out
+
+
+def _holds(box: Box, points: np.ndarray) -> bool:
+    """Whether all points (K, 3) are inside a box."""
+    local = (points - box.position) @ box.rotation
+    return bool(np.all(np.abs(local) < box.size / 2 - 1e-9))

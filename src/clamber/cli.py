@@ -153,7 +153,7 @@ class WorldFlags:
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
     ] = None
-    """A scene.yaml."""
+    """A scene.yaml, or boxes as OBJ or MJCF."""
 
     def load(self) -> tuple[clamber.Robot, clamber.Scene]:
         """Robot and scene, the scene first checked as the cheaper one."""
@@ -444,25 +444,47 @@ class ExportCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCommand:
-    """Check a scene file and say what is in it."""
+    """Check a scene, say what is in it and, with --out, draw it."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A scene.yaml."""
+    """A scene.yaml, or boxes as OBJ or MJCF."""
+    robot: str = "coman"
+    """Who stands at its start: a built-in robot by name, or a robot.yaml."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Where to write the picture scene.png."""
     output: Printed
 
     def run(self) -> int:
         """Scene file to a table of its supports."""
         scene = clamber.load_scene(self.file)
-        table = _table("support", "centre [m]", "slope [rad]", "friction")
+        table = _table("support", "centre [m]", "slope [deg]", "friction", "")
         supports = []
+        faults = clamber.check_scene(scene)
         for s in scene.supports:
             centre = [round(float(x), 6) for x in s.position]
-            slope = math.acos(min(1.0, float(s.normal[2])))
-            supports.append({"name": s.name, "centre": centre, "friction": s.friction})
+            slope = math.degrees(math.acos(min(1.0, float(s.normal[2]))))
+            fault = faults.get(s.name, "")
+            supports.append(
+                {
+                    "name": s.name,
+                    "centre": centre,
+                    "slope": round(slope, 4),
+                    "friction": s.friction,
+                    "fault": fault,
+                }
+            )
             text = " ".join(f"{x:.3f}" for x in centre)
-            table.add_row(s.name, text, f"{slope:.3f}", f"{s.friction:g}")
-        self.output.show({"supports": supports}, table)
-        return REACHED
+            table.add_row(s.name, text, f"{slope:.1f}", f"{s.friction:g}", fault)
+        record: dict[str, Any] = {"supports": supports, "picture": None}
+        note = ""
+        if self.out is not None:
+            robot = clamber.load_robot(self.robot)
+            folder = clamber.new_run_folder(self.out, "scene")
+            record["picture"] = note = str(
+                clamber.draw_scene(robot, scene, folder / "scene.png")
+            )
+        self.output.show(record, table, note=note)
+        return MISSED if faults else REACHED
 
 
 @dataclass(frozen=True, kw_only=True)

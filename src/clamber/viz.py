@@ -297,6 +297,35 @@ def near_edge_points(scene: Scene) -> np.ndarray:
     return np.concatenate([edge, edge * [1.0, 1.0, 0.0]])
 
 
+def draw_scene(
+    robot: Robot, scene: Scene, path: str | Path, *, tile: tuple[int, int] = (760, 560)
+) -> Path:
+    """Draw a scene with the robot at its start, its supports named, the goal marked."""
+    world = build_world(robot, scene)
+    kin = Kinematics(world)
+    kin.update(world.home)
+    tops = [s for s in scene.supports if s.name != GROUND]
+    seen = [robot_corners(kin)]
+    seen += [s.position + s.polygon @ s.rotation[:, :2].T for s in tops]
+    yaw, fovy = float(scene.start[2]), float(world.model.vis.global_.fovy)
+    view = frame_view(np.concatenate(seen), tile[0] / tile[1], yaw=yaw, fovy=fovy)
+    with Camera(world, tile) as camera:
+        picture = camera.shot(world.home, view)
+    draw = ImageDraw.Draw(picture)
+    for s in tops:
+        at, tip = view.project(
+            np.stack([s.position, s.position + 0.15 * s.normal]), tile
+        )
+        _arrow(draw, at, tip, DARK)
+        draw.text((at[0] + 8, at[1] + 4), s.name, font=_font(15), fill=DARK)
+    if scene.goal is not None:
+        at = view.project(np.array([*scene.goal[:2], 0.0]), tile)
+        _dot(draw, at, 6, PHASE_COLOURS["supporting"])
+        draw.text((at[0] + 8, at[1] - 8), "goal", font=_font(15), fill=DARK)
+    caption = f"{len(tops)} boxes, {robot.name} at the start"
+    return _save_sheet([(picture, [caption])], path, columns=1)
+
+
 # Sheets of pictures.
 
 

@@ -11,6 +11,7 @@ posture that closes every contact, balanced and free of collisions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -220,12 +221,18 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
     d = projected_distance(c.position, mass)
     theta = contact_angle(c.position, mass)
     length = float(np.linalg.norm(mass - c.position))
-    limit = theta_max(kin.world.supports[c.support].friction)
+    support = kin.world.supports[c.support]
+    limit = theta_max(support.friction)
+    phase = contact_phase(d, length, limit, loaded=loaded)
+    # On a slope the line to the mass must lie within the cone about the normal too.
+    slope = contact_angle(c.position, mass, support.normal)
+    if support.normal[2] < 1.0 and slope > math.atan(support.friction):
+        phase = "sliding"
     return ContactState(
         contact=c,
         projected_distance=d,
         contact_angle=theta,
-        phase=contact_phase(d, length, limit, loaded=loaded),
+        phase=phase,
     )
 
 
