@@ -78,7 +78,7 @@ def links_of(model: mujoco.MjModel) -> np.ndarray:
     return out
 
 
-def anatomy(
+def find_limbs(
     model: mujoco.MjModel, source: object, mimics: Mapping[str, str] | None = None
 ) -> Anatomy:
     """Find the limbs.

@@ -15,6 +15,7 @@ from clamber.errors import InputError
 from clamber.se3 import matrix_from_rpy
 
 NAME = r"^[A-Za-z][A-Za-z0-9_]*$"  # of a box
+_LARGEST = 1e6  # [m]
 _FIT = 2e-3  # [m] a vertex further than this from the fitted box is no box's
 
 
@@ -151,6 +152,8 @@ def _tilted(v: np.ndarray) -> np.ndarray | None:
     Three ways from one corner are its edges where they are square to each other; of
     those that are, the shortest: the others are diagonals of faces.
     """
+    if np.abs(v).max() > _LARGEST:
+        return None
     ways = v[1:] - v[0]
     best, axes = np.inf, None
     for triple in itertools.combinations(ways, 3):

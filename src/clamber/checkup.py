@@ -193,7 +193,7 @@ def check_scene(scene: Scene) -> dict[str, str]:
     """What is wrong with each support, by name; those without a fault are left out.
 
     A top steeper than its friction bears nothing, one below the ground is not there,
-    and one inside another box cannot be stood on.
+    one inside another box cannot be stood on, and none may be where the robot starts.
     """
     out = {}
     for s in scene.supports[1:]:
@@ -208,6 +208,8 @@ def check_scene(scene: Scene) -> dict[str, str]:
             out[s.name] = "below the ground"
         elif inside:
             out[s.name] = f"its top is inside {inside[0]}"
+        elif s.inside(np.array([*scene.start[:2], s.position[2]])):
+            out[s.name] = "the robot starts in it: move start"
     return out
 
 

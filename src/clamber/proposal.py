@@ -27,7 +27,7 @@ from scipy.spatial import ConvexHull, QhullError
 from clamber.anatomy import (
     Anatomy,
     Chain,
-    anatomy,
+    find_limbs,
     geom_points,
     hangs_on,
     joint_range,
@@ -125,7 +125,7 @@ def propose_robot(
             description with the same joint names, or a YAML mapping of joints to N m.
 
     Raises:
-        InputError: It cannot be read, or is no humanoid; see `anatomy`.
+        InputError: It cannot be read, or is no humanoid; see `find_limbs`.
     """
     path = Path(path)
     description = read_description(path, lenient=True)
@@ -236,7 +236,7 @@ def _upright(
             notes.append(
                 f"{model.body(b).name} has no inertia in the description: 1 g is taken"
             )
-    found = anatomy(model, path, description.mimics)
+    found = find_limbs(model, path, description.mimics)
     model.qpos0[:] = model.qpos0
     x, y = found.forward[:2]
     if x < 1 - 1e-9:
@@ -248,7 +248,7 @@ def _upright(
         model.qpos0[start + 3 : start + 7] = quat
         model.body_quat[found.base] = quat
         notes.append(f"turned by {np.degrees(turn):.0f} degrees to face along x")
-        found = anatomy(model, path, description.mimics)
+        found = find_limbs(model, path, description.mimics)
     return model, found, notes
 
 
