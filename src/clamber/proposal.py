@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -410,12 +410,16 @@ def _around(name: str, link: int, points: np.ndarray, data: mujoco.MjData) -> Sh
     # Half length a and radius r hold pi r^2 (2 (a - r) + 4/3 r), growing up to r = a.
     r = float(np.sqrt(b * c))
     if np.isfinite(volume) and volume < 4 / 3 * np.pi * a**3:
-        r = brentq(lambda r: np.pi * r**2 * (2 * a - 2 / 3 * r) - volume, 0.0, a)
+        r = _root(lambda r: np.pi * r**2 * (2 * a - 2 / 3 * r) - volume, 0.0, a)
     R = np.stack([R[:, 1], R[:, 2], R[:, 0]], axis=1)
     p, R = _in_link(data, link, centre, R)
     if a - r < 1e-3:
         return _shape(name, link, "sphere", (r,), p, R)
     return _shape(name, link, "capsule", (r, a - r), p, R)
+
+
+def _root(f: Callable[[float], float], low: float, high: float) -> float:
+    return float(np.asarray(brentq(f, low, high)))
 
 
 def _of_inertia(

@@ -283,10 +283,11 @@ class SceneFile(_Strict):
         """
         if isinstance(self.boxes, str):
             boxes, friction = drawn_boxes(folder / self.boxes, self.friction)
-            said = "friction" in self.ground.model_fields_set or friction is None
+            if friction is None or "friction" in self.ground.model_fields_set:
+                friction = self.ground.friction
             return Scene(
                 boxes=boxes,
-                ground_friction=self.ground.friction if said else friction,
+                ground_friction=friction,
                 start=np.array(self.start),
                 goal=None if self.goal is None else np.array(self.goal),
             )

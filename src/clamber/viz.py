@@ -319,7 +319,7 @@ def draw_scene(
         _arrow(draw, at, tip, DARK)
         draw.text((at[0] + 8, at[1] + 4), s.name, font=_font(15), fill=DARK)
     if scene.goal is not None:
-        at = view.project(np.array([*scene.goal[:2], 0.0]), tile)
+        at = tuple(view.project(np.array([*scene.goal[:2], 0.0]), tile))
         _dot(draw, at, 6, PHASE_COLOURS["supporting"])
         draw.text((at[0] + 8, at[1] - 8), "goal", font=_font(15), fill=DARK)
     caption = f"{len(tops)} boxes, {robot.name} at the start"
@@ -351,9 +351,9 @@ def draw_robot(
                 x, y = view.project(kin.landmark(limb.root)[1], tile)
                 draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline=DARK, width=2)
                 for surface, colour in zip(
-                    limb.surfaces, SURFACE_COLOURS, strict=False
+                    limb.surfaces, ((194, 65, 12), (29, 78, 216)), strict=False
                 ):
-                    at = view.project(kin.contact_point(surface, up), tile)
+                    at = tuple(view.project(kin.contact_point(surface, up), tile))
                     _dot(draw, at, 5, colour)
                     draw.text(
                         (at[0] + 8, at[1] - 8), surface, font=_font(15), fill=DARK
