@@ -106,10 +106,16 @@ def find_limbs(
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     coupled = {*(mimics or {}), *(mimics or {}).values()}
-    grips = frozenset(
+    free_moving = [
         int(model.jnt_bodyid[j])
         for j in range(model.njnt)
-        if model.joint(j).name in coupled
+        if model.joint(j).name not in coupled
+    ]
+    # Grippers: bodies on whose joints nothing hangs that moves on its own.
+    grips = frozenset(
+        b
+        for b in range(1, model.nbody)
+        if model.body_jntnum[b] and not any(hangs_on(model, x, b) for x in free_moving)
     )
     pairs = _paired(model, data, base, grips)
     if len(pairs) < 2:
