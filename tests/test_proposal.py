@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 
 import mujoco
@@ -294,6 +295,19 @@ def test_names_of_a_description_cannot_leave_the_folder(tmp_path):
     proposal = propose_robot(path)
     assert "/" not in proposal.name
     assert proposal.fields["model"] == "robot.xml"
+
+
+def test_the_g1_of_a_wheel_is_found_where_it_is_installed(tmp_path):
+    spec = importlib.util.find_spec("mjlab")
+    if spec is None or spec.origin is None:
+        pytest.skip("the mjlab wheel is not installed")
+    home = Path(spec.origin).parent / "asset_zoo" / "robots" / "unitree_g1" / "xmls"
+    proposal = propose_robot(home / "g1.xml")
+    save_proposal(proposal, tmp_path)
+    found = check_robot(load_robot(tmp_path / "robot.yaml"))
+    assert found.faults == ()
+    assert found.joints == 29
+    assert found.knee_height == pytest.approx(0.351, abs=0.002)
 
 
 @pytest.mark.slow
