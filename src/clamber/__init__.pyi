@@ -1,3 +1,6 @@
+from clamber.checkup import Checkup as Checkup
+from clamber.checkup import check_robot as check_robot
+from clamber.checkup import check_scene as check_scene
 from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
@@ -26,6 +29,7 @@ from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
 from clamber.io import save_policy as save_policy
+from clamber.io import save_proposal as save_proposal
 from clamber.io import save_rollout as save_rollout
 from clamber.io import save_sequence as save_sequence
 from clamber.io import save_verdict as save_verdict
@@ -46,6 +50,8 @@ from clamber.policy import GeneralPolicy as GeneralPolicy
 from clamber.policy import Option as Option
 from clamber.policy import PelvisDistribution as PelvisDistribution
 from clamber.policy import pelvis_distribution as pelvis_distribution
+from clamber.proposal import Proposal as Proposal
+from clamber.proposal import propose_robot as propose_robot
 from clamber.scene import Box as Box
 from clamber.scene import Scene as Scene
 from clamber.scene import Support as Support
@@ -58,6 +64,8 @@ from clamber.simulation import simulate as simulate
 from clamber.sweep import load_sweep as load_sweep
 from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
+from clamber.viz import draw_robot as draw_robot
+from clamber.viz import draw_scene as draw_scene
 from clamber.viz import render_run as render_run
 
 __version__: str

@@ -153,7 +153,7 @@ class WorldFlags:
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
     ] = None
-    """A scene.yaml."""
+    """A scene.yaml, or boxes as OBJ or MJCF."""
 
     def load(self) -> tuple[clamber.Robot, clamber.Scene]:
         """Robot and scene, the scene first checked as the cheaper one."""
@@ -683,64 +683,121 @@ class ExportCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCommand:
-    """Check a scene file and say what is in it."""
+    """Check a scene, say what is in it and, with --out, draw it."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A scene.yaml."""
+    """A scene.yaml, or boxes as OBJ or MJCF."""
+    robot: str = "coman"
+    """Who stands at its start: a built-in robot by name, or a robot.yaml."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Where to write the picture scene.png."""
     output: Printed
 
     def run(self) -> int:
         """Scene file to a table of its supports."""
         scene = clamber.load_scene(self.file)
-        table = _table("support", "centre [m]", "slope [rad]", "friction")
+        table = _table("support", "centre [m]", "slope [deg]", "friction", "")
         supports = []
+        faults = clamber.check_scene(scene)
         for s in scene.supports:
             centre = [round(float(x), 6) for x in s.position]
-            slope = math.acos(min(1.0, float(s.normal[2])))
-            supports.append({"name": s.name, "centre": centre, "friction": s.friction})
+            slope = math.degrees(math.acos(min(1.0, float(s.normal[2]))))
+            fault = faults.get(s.name, "")
+            supports.append(
+                {
+                    "name": s.name,
+                    "centre": centre,
+                    "slope": round(slope, 4),
+                    "friction": s.friction,
+                    "fault": fault,
+                }
+            )
             text = " ".join(f"{x:.3f}" for x in centre)
-            table.add_row(s.name, text, f"{slope:.3f}", f"{s.friction:g}")
-        self.output.show({"supports": supports}, table)
-        return REACHED
+            table.add_row(s.name, text, f"{slope:.1f}", f"{s.friction:g}", fault)
+        record: dict[str, Any] = {"supports": supports, "picture": None}
+        note = ""
+        if self.out is not None:
+            robot = clamber.load_robot(self.robot)
+            folder = clamber.new_run_folder(self.out, "scene")
+            record["picture"] = note = str(
+                clamber.draw_scene(robot, scene, folder / "scene.png")
+            )
+        self.output.show(record, table, note=note)
+        return MISSED if faults else REACHED
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotCommand:
-    """Check a robot: load it, stand it up and say what a planner sees of it."""
+    """Bring a robot: init proposes a robot.yaml, check says what is wrong with one."""
 
-    action: tyro.conf.Positional[Literal["check"]]
-    """What to do with it."""
+    action: tyro.conf.Positional[Literal["init", "check"]]
+    """init: from an MJCF or URDF. check: a robot.yaml."""
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """A built-in robot by name, or a robot.yaml."""
+    """init: an MJCF or URDF file. check: a robot.yaml, or a built-in robot by name."""
+    effort: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """init: effort limits the model lacks: YAML {joint: N m}, or another model."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: init: robots/NAME)"),
+    ] = None
+    """Where to write robot.yaml and robot.xml (init), and the picture robot.png."""
     output: Printed
 
     def run(self) -> int:
-        """Robot file to a table of its limbs."""
-        import numpy as np
-
-        robot = clamber.load_robot(self.model)
-        world = clamber.build_world(robot, clamber.Scene(start=np.zeros(3)))
-        kin = clamber.Kinematics(world)
-        kin.update(world.home)
-        table = _table("limb", "from", "to", "surfaces")
+        """Description to a proposal, or a robot file to what a planner sees of it."""
+        notes: list[str] = []
+        path, out = self.model, self.out
+        if self.action == "init":
+            proposal = clamber.propose_robot(self.model, effort_from=self.effort)
+            out = out or Path("robots") / proposal.name
+            if out.exists() and (not out.is_dir() or any(out.iterdir())):
+                raise InputError(
+                    "a new or empty folder", source="--out", value=str(out)
+                )
+            out = clamber.new_run_folder(out, "robot")
+            clamber.save_proposal(proposal, out)
+            path, notes = str(out / "robot.yaml"), list(proposal.notes)
+        robot = clamber.load_robot(path)
+        found = clamber.check_robot(robot)
+        table = _table("limb", "from", "over", "to", "surfaces", "length [m]")
         for limb in robot.limbs.values():
-            table.add_row(limb.name, limb.root, limb.end, ", ".join(limb.surfaces))
-        segments = {k: round(v, 4) for k, v in clamber.limb_lengths(kin).items()}
+            table.add_row(
+                limb.name,
+                limb.root,
+                limb.middle,
+                limb.end,
+                ", ".join(limb.surfaces),
+                f"{found.lengths[limb.name]:.3f}",
+            )
+        if out is not None:
+            try:
+                clamber.draw_robot(robot, out / "robot.png")
+            except ClamberError as e:  # the robot is checked all the same
+                notes.append(str(e))
         record = {
+            "out": None if out is None else str(out),
             "name": robot.name,
-            "mass": round(world.mass, 4),
-            "joints": len(world.joints),
+            "mass": round(found.mass, 4),
+            "joints": found.joints,
             "surfaces": list(robot.surfaces),
-            "segments": segments,
-            "com_height": round(float(kin.com[2]), 4),
+            "segments": found.segments,
+            "knee_height": found.knee_height,
+            "com_height": found.com_height,
+            "faults": list(found.faults),
+            "notes": notes,
         }
-        lengths = ", ".join(f"{k} {v:.3f} m" for k, v in segments.items())
-        note = (
-            f"{robot.name}: {world.mass:.2f} kg, {len(world.joints)} actuated joints, "
-            f"CoM {kin.com[2]:.3f} m high as it stands; {lengths}"
-        )
-        self.output.show(record, table, note=note)
-        return REACHED
+        lengths = ", ".join(f"{k} {v:.3f} m" for k, v in found.segments.items())
+        lines = [
+            *(f"note: {x}" for x in notes),
+            *(f"wrong: {x}" for x in found.faults),
+            f"{robot.name}: {found.mass:.2f} kg, {found.joints} actuated joints, CoM"
+            f" {found.com_height:.3f} m and knees {found.knee_height:.3f} m high as it"
+            f" stands; {lengths}",
+        ]
+        if out is not None:
+            lines.append(f"the files are in {out}: look at robot.png")
+        self.output.show(record, table, note="\n".join(lines))
+        return MISSED if found.faults else REACHED
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,6 +44,7 @@ from clamber.pipeline import Midway, Plan, PlanOptions, Skipped
 from clamber.policy import DemoPolicy, GeneralPolicy, Option, PelvisDistribution, Place
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
+from clamber.proposal import Proposal, robot_yaml
 from clamber.scene import Box, Scene, input_error, read_yaml
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
@@ -56,6 +57,7 @@ POLICY = "policy.json"
 PLAN = "plan.json"
 TRAJECTORY = "trajectory.npz"
 SCENE = "scene.xml"
+ROBOT = "robot.yaml"
 ASSETS = "assets"
 TIMINGS = "timings.json"
 ROLLOUT = "rollout.npz"
@@ -818,6 +820,7 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
             for n, x in robot.limbs.items()
         },
         "surfaces": robot.prefixes,
+        "effort": robot.effort,
         "gains": {
             n: dict(zip(("kp", "kd", "ki"), g, strict=True))
             for n, g in robot.gains.items()
@@ -905,6 +908,16 @@ def _with_assets(world: World, folder: Path) -> str:
         with _whole(folder / ASSETS / name) as stream:
             stream.write(content)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def save_proposal(proposal: Proposal, folder: str | Path) -> None:
+    """Write `robot.yaml` and the model that it names into a folder."""
+    for name, text in (
+        (proposal.fields["model"], proposal.mjcf),
+        (ROBOT, robot_yaml(proposal)),
+    ):
+        with _whole(Path(folder) / name) as stream:
+            stream.write(text.encode())
 
 
 def load_plan(folder: str | Path) -> Plan:
@@ -1000,6 +1013,7 @@ def _robot(file: RobotFile) -> Robot:
             if (x := file.limbs.get(n))
         },
         prefixes=file.surfaces,
+        effort=file.effort,
         gains={n: (g.kp, g.kd, g.ki) for n, g in file.gains.items()},
         impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
         self_positioning=tuple(file.self_positioning),

@@ -330,7 +330,9 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     up, up_planned = (_up(q[3:7]) for q in (last, planned))
     tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
     supports = rollout.world.supports
-    tops = [supports[c.support].position[2] for c in final if c.support in supports]
+    over = [
+        supports[c.support].height(last[:3]) for c in final if c.support in supports
+    ]
     order = [world.model.actuator(j).id for j in world.joints]
     share = np.abs(rollout.actuator_force[:, order]) / rollout.world.tau_max
     effort = float(share.max(initial=0.0))
@@ -358,7 +360,7 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     if world.scene.goal is None:
         goal["share of the weight at the end on obstacles"] = _at_least(on_boxes, 0.98)
         goal["pelvis above its support at the end [m]"] = _at_least(
-            float(last[2] - max(tops, default=0.0)), 0.05
+            float(min(over, default=last[2])), 0.05
         )
     else:
         xy = world.scene.goal[:2]
