@@ -42,8 +42,8 @@ from clamber.policy import (
     pelvis_rotation,
     wrap,
 )
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import Keyframe, contact_state
+from clamber.posture.ik import IK, PostureProblem
+from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
 from clamber.route import Place, Platform, find_place, find_platforms, goal_of
 from clamber.scene import GROUND, Scene
 from clamber.se3 import matrix_from_quat, quat_from_matrix
@@ -51,7 +51,7 @@ from clamber.search import home_at, plan_step, standing
 from clamber.trajectory import build_trajectory
 
 STEPS = 3.0  # f of (5.9): a step is this part of what a limb reaches
-TURN = 0.35  # [rad] of the body in one cycle on all fours
+TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
 SHRUNK = (1.0, 0.6, 0.3)  # a step that fails is tried shorter
 SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
@@ -63,6 +63,7 @@ BESIDE_TOL = 0.10  # [m] along the edge
 REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
+LEAN = np.radians(80.0)  # of the trunk on all fours, where the policy imposes none
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
@@ -131,6 +132,7 @@ class _Task:
     goal: np.ndarray
     goal_yaw: float | None
     build: _Build
+    fours: np.ndarray
 
 
 _Made = tuple[Keyframe, Path, str]
@@ -622,7 +624,7 @@ def _crawl(
     for body in tries:
         made: list[_Made] = []
         now = key
-        for surface in option.surfaces:
+        for surface in _leading_first(task, option, frame, full):
             limb = task.ik.world.robot.limb_of(surface)
             here = _by_limb(task, now.stance)[limb.name]
             if exact:
@@ -634,7 +636,7 @@ def _crawl(
                 )
             if np.linalg.norm(place.position - here.position) < SAME:
                 continue
-            found = _attempt(task, now, surface, here, place, body, None)
+            found = _attempt(task, now, surface, here, place, body, task.fours)
             if isinstance(found, str):
                 why = found
                 continue
@@ -643,6 +645,21 @@ def _crawl(
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
+
+
+def _leading_first(
+    task: _Task, option: Option, frame: _Frame, full: _Frame
+) -> tuple[str, ...]:
+    """The cycle, begun with the limbs that are ahead on the way: arms, or legs.
+
+    Where elbows follow knees and step first, what bears the robot shrinks.
+    """
+    way = _turn(frame.yaw).T @ (full.xy - frame.xy)
+    arms_lead = way[0] > -1e-6
+    robot = task.ik.world.robot
+    leads = [robot.limb_of(s).is_arm == arms_lead for s in option.surfaces]
+    k = leads.index(True) if True in leads else 0
+    return option.surfaces[k:] + option.surfaces[:k]
 
 
 # One contact.
@@ -751,6 +768,7 @@ def _task(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> _Task:
     scene = ik.world.scene
     goal = goal_of(scene)
     yaw = scene.goal
+    build = _build(ik, policy)
     return _Task(
         ik=ik,
         policy=policy,
@@ -758,8 +776,46 @@ def _task(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> _Task:
         platforms=find_platforms(scene, goal),
         goal=goal,
         goal_yaw=float(yaw[2]) if yaw is not None and len(yaw) == 3 else None,
-        build=_build(ik, policy),
+        build=build,
+        fours=_posture_on_fours(ik, policy, build),
     )
+
+
+def _posture_on_fours(ik: IK, policy: GeneralPolicy, build: _Build) -> np.ndarray:
+    """(nq,) the robot on elbows and knees, held as the policy holds its pelvis.
+
+    What steps on all fours stay near to, so that twists do not add up.
+    """
+    world = ik.world
+    option = next((o for o in policy.options if o.region == "O"), None)
+    if option is None:
+        return world.home
+    frame = _Frame(world.scene.start[:2], float(world.scene.start[2]))
+    up = {}
+    for surface in option.surfaces:
+        xy = frame.at(build.fours[world.robot.limb_of(surface).name])
+        place = Place(support=GROUND, position=np.array([*xy, 0.0]))
+        up[surface] = _contact(world, surface, place, frame.yaw)
+    lean = policy.over_top.imposed[1]
+    pitch = 0.5 * sum(lean) if lean is not None else LEAN
+    held = pelvis_rotation(np.array([0.0, pitch, frame.yaw]))
+    q = world.home.copy()
+    q[3:7] = quat_from_matrix(held)
+    q[2] *= 0.7
+    problem = PostureProblem(
+        goals=tuple(held_goal(world, c) for c in up.values()),
+        q_reference=world.home,
+        clearance=_own_clearance(world),
+        base_rotation=held,
+        base_weight=1.0,
+    )
+    return ik.solve_hard(problem, q).q
+
+
+def _own_clearance(world: World) -> np.ndarray:
+    """(P,) the robot keeps off itself; the scene does not count."""
+    own = (world.model.geom_bodyid[world.pairs] > 0).all(axis=1)
+    return np.where(own, CLEARANCE, -np.inf)
 
 
 def _build(ik: IK, policy: GeneralPolicy) -> _Build:
