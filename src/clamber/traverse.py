@@ -442,11 +442,8 @@ def _left_of(
 
 def _descent(
     task: _Task, platform: Platform
-) -> tuple[tuple[Keyframe, ...], list[tuple[Step, str]]] | str:
-    """Keyframes of the ascent from behind the far edge; its steps reversed.
-
-    Or why there is none.
-    """
+) -> list[tuple[Step, str]] | str:
+    """The ascent from behind the far edge with its steps reversed, or why not."""
     edge = platform.exit
     assert edge is not None
     world = task.ik.world
@@ -483,7 +480,7 @@ def _descent(
                 name,
             )
         )
-    return found.keyframes, out
+    return out
 
 
 def _home_ahead(task: _Task) -> np.ndarray:
@@ -506,7 +503,7 @@ def _climb_down(
     robot = task.ik.world.robot
     now = {robot.limb_of(c.surface).name: c.surface for c in key.stance}
     steps, names = [], []
-    for step, name in there[1]:
+    for step, name in there:
         limb = step.move.limb
         if now.get(limb) not in step.move.breaks:
             continue
@@ -537,24 +534,11 @@ def _on_fours(
         wanted = _Frame(task.goal, yaw)
         if _there(frame, wanted):
             return [], ""
-        return _crawl(task, key, platform, frame, wanted, {})
+        return _crawl(task, key, platform, frame, wanted)
     wanted = _behind(task, platform.exit)
-    exact: dict[str, Contact] = {}
-    step = _crawl_step(task)
-    if _cycles(frame, wanted, step, TURN) <= 1.0:
-        there = _descent(task, platform)
-        if isinstance(there, str):
-            return [], there
-        exact = {
-            task.ik.world.robot.limb_of(c.surface).name: c for c in there[0][-1].stance
-        }
-        off = [
-            np.linalg.norm(exact[n].position - c.position)
-            for n, c in _by_limb(task, key.stance).items()
-        ]
-        if max(off) < ARRIVED:
-            return _climb_down(task, key, platform)
-    return _crawl(task, key, platform, frame, wanted, exact)
+    if _there(frame, wanted):
+        return _climb_down(task, key, platform)
+    return _crawl(task, key, platform, frame, wanted)
 
 
 def _behind(task: _Task, edge: Edge) -> _Frame:
@@ -586,12 +570,6 @@ def _crawl_step(task: _Task) -> float:
     return min(task.build.step.values())
 
 
-def _cycles(a: _Frame, b: _Frame, step: float, turn: float) -> float:
-    """How many cycles it is from one frame to another."""
-    away = float(np.linalg.norm(b.xy - a.xy))
-    return max(away / step, abs(float(wrap(b.yaw - a.yaw))) / turn)
-
-
 def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
     """One cycle from `a` towards `b`: the way first, the turn as late as it can be."""
     way, angle = b.xy - a.xy, float(wrap(b.yaw - a.yaw))
@@ -608,9 +586,8 @@ def _crawl(
     platform: Platform,
     frame: _Frame,
     wanted: _Frame,
-    exact: dict[str, Contact],
 ) -> tuple[list[_Made], str]:
-    """One cycle towards `wanted`, or to the contacts `exact` by limb."""
+    """One cycle towards `wanted`."""
     option = next(o for o in task.policy.options if o.region == "O")
     step = _crawl_step(task)
     full = _between(frame, wanted, step, TURN)
@@ -624,24 +601,26 @@ def _crawl(
     for body in tries:
         made: list[_Made] = []
         now = key
-        for surface in _leading_first(task, option, frame, full):
-            limb = task.ik.world.robot.limb_of(surface)
-            here = _by_limb(task, now.stance)[limb.name]
-            if exact:
-                c = exact[limb.name]
-                place = Place(support=c.support, position=c.position)
-            else:
-                place = _place(
-                    task, platform, surface, body.at(task.build.fours[limb.name])
+        left = list(_leading_first(task, option, frame, full))
+        # What cannot move yet is tried again once the others have, and then shorter.
+        for shares in (SHRUNK[:1], SHRUNK):
+            for surface in tuple(left):
+                limb = task.ik.world.robot.limb_of(surface)
+                here = _by_limb(task, now.stance)[limb.name]
+                at = body.at(task.build.fours[limb.name])
+                place = _place(task, platform, surface, at)
+                if np.linalg.norm(place.position - here.position) < SAME:
+                    left.remove(surface)
+                    continue
+                found = _attempt(
+                    task, now, surface, here, place, body, task.fours, shares
                 )
-            if np.linalg.norm(place.position - here.position) < SAME:
-                continue
-            found = _attempt(task, now, surface, here, place, body, task.fours)
-            if isinstance(found, str):
-                why = found
-                continue
-            now, path = found
-            made.append((now, path, option.name))
+                if isinstance(found, str):
+                    why = found
+                    continue
+                now, path = found
+                made.append((now, path, option.name))
+                left.remove(surface)
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
@@ -673,12 +652,13 @@ def _attempt(
     place: Place,
     body: _Frame,
     reference: np.ndarray | None,
+    shares: Sequence[float] = SHRUNK,
 ) -> tuple[Keyframe, Path] | str:
     """Move one contact to a place, or part of the way there; or why not."""
     world = task.ik.world
     limb = world.robot.limb_of(surface)
     why = ""
-    for share in SHRUNK:
+    for share in shares:
         position = place.position
         if share < 1.0:
             if here.support != place.support:
