@@ -28,10 +28,12 @@ from clamber.search import standing
 from clamber.statics import com_margin, support_polygon
 from clamber.trajectory import HOLD_END, HOLD_START, RATE, Trajectory, build_trajectory
 from clamber.transition import balance_problem
+from clamber.traverse import follow_policy
 
 REACH = 0.12  # [m] a contact is looked for this far from where it was planned
 FEELING_SPEED = 0.06  # [m/s] along the normal
 FEELING_NODES = 9  # postures on the way
+HORIZON = 6  # contact changes that a policy is followed ahead; then it goes on from there
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
@@ -44,12 +46,14 @@ class Adapted:
         trajectory: None where there is no way, or nothing left to do.
         keyframes: The present stance first; one more for each step.
         missed: Why steps are missing; empty where none is.
+        more: A policy goes on from the last keyframe.
     """
 
     world: World
     trajectory: Trajectory | None
     keyframes: tuple[Keyframe, ...]
     missed: str
+    more: bool = False
 
 
 def adapt_plan(
@@ -137,17 +141,31 @@ def start_again(plan: Plan, scene: Scene) -> Adapted:
     return _rest(plan, ik, 0, standing(ik, plan.options.keyframe), ())
 
 
+def go_on(plan: Plan, world: World, key: Keyframe) -> Adapted:
+    """A policy followed on from the last keyframe of what was planned ahead."""
+    return _rest(plan, IK(world), 0, key, ())
+
+
 def _rest(
     plan: Plan, ik: IK, made: int, key: Keyframe, lead: tuple[Phase, ...]
 ) -> Adapted:
-    """The steps after the first `made`, from a keyframe that `lead` leads to."""
-    world = ik.world
-    try:
-        sequence = retarget(plan.sequence, world)
-    except InputError as e:
-        return Adapted(world=world, trajectory=None, keyframes=(key,), missed=str(e))
-    steps = _from_here(split_moves(sequence, world)[0][made:], key, world)
-    found, _ = search_steps(ik, steps, plan.options, start=key)
+    """The steps after the first `made`, from a keyframe that `lead` leads to.
+
+    A policy needs no count: it is followed from the stance, some steps ahead.
+    """
+    world, more = ik.world, False
+    if plan.policy is not None:
+        found = follow_policy(ik, plan.policy, key, plan.options, HORIZON)
+        missed, more = found.missed, not (found.arrived or found.missed)
+    else:
+        try:
+            sequence = retarget(plan.sequence, world)
+        except InputError as e:
+            missed = str(e)
+            return Adapted(world=world, trajectory=None, keyframes=(key,), missed=missed)
+        steps = _from_here(split_moves(sequence, world)[0][made:], key, world)
+        found, _ = search_steps(ik, steps, plan.options, start=key)
+        missed = found.missed[0].reason if found.missed else ""
     phases = [*lead, *(p for path in found.paths for p in path.phases)]
     ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in found.paths])
     trajectory = None
@@ -159,7 +177,8 @@ def _rest(
         world=world,
         trajectory=trajectory,
         keyframes=found.keyframes,
-        missed=found.missed[0].reason if found.missed else "",
+        missed=missed,
+        more=more,
     )
 
 

@@ -39,7 +39,7 @@ from clamber.contact import (
 from clamber.errors import InputError, Status
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
-from clamber.pipeline import Plan, PlanOptions, Skipped
+from clamber.pipeline import Iteration, Plan, PlanOptions, Skipped
 from clamber.policy import DemoPolicy, GeneralPolicy, Option, PelvisDistribution, Place
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
@@ -694,6 +694,11 @@ class _SkippedFile(pydantic.BaseModel):
     missed: bool = False
 
 
+class _IterationFile(pydantic.BaseModel):
+    option: str
+    cost: float
+
+
 class _PlanFile(pydantic.BaseModel):
     options: dict[str, Any]
     robot: RobotFile
@@ -701,6 +706,8 @@ class _PlanFile(pydantic.BaseModel):
     keyframes: list[_KeyframeFile] = pydantic.Field(min_length=1)
     skipped: list[_SkippedFile]
     complete: bool
+    policy: _GeneralFile | None = None
+    iterations: list[_IterationFile] = []
 
 
 class _TimingsFile(pydantic.BaseModel):
@@ -734,6 +741,12 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         if path.is_file():
             hashes[name] = _sha256(path.read_bytes())
     kin = Kinematics(world)
+    followed: dict[str, Any] = {}
+    if plan.policy is not None:
+        followed = {
+            "policy": policy_fields(plan.policy),
+            "iterations": [asdict(i) for i in plan.iterations],
+        }
     return {
         "complete": plan.complete,
         "options": asdict(plan.options),
@@ -753,7 +766,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "skipped": [asdict(s) for s in plan.skipped],
         "sequence": sequence_fields(plan.sequence)
         | {"scene": scene_fields(world.scene)},
-    }
+    } | followed
 
 
 def _robot_fields(robot: Robot) -> dict[str, Any]:
@@ -919,6 +932,8 @@ def load_plan(folder: str | Path) -> Plan:
         trajectory=trajectory,
         complete=file.complete,
         timings=timings,
+        policy=None if file.policy is None else file.policy.policy(path, "policy."),
+        iterations=tuple(Iteration(**i.model_dump()) for i in file.iterations),
     )
 
 
