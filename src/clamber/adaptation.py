@@ -32,7 +32,8 @@ from clamber.traverse import follow_policy
 
 REACH = 0.12  # [m] a contact is looked for this far from where it was planned
 FEELING_SPEED = 0.06  # [m/s] along the normal
-FEELING_NODES = 9  # postures on the way
+FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
+FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
 HORIZON = 6  # contact changes that a policy is followed ahead; then it goes on from there
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
@@ -209,21 +210,49 @@ def feeling(
         As far as can be reached, at most `REACH`; None where that is nowhere, or the
         others do not balance the robot alone.
     """
-    lower = tuple(
-        replace(b, position=b.position - REACH * b.top.normal)
-        if b.name == contact.support
-        else b
-        for b in world.scene.boxes
-    )
-    world = build_world(world.robot, replace(world.scene, boxes=lower))
     ik = IK(world)
+    free = _limb_over(world, contact)
     ik.kin.update(q)
     points = bearing_frames(ik.kin, held)[1][:, :2]
-    if com_margin(ik.kin.com[:2], support_polygon(points)) <= 0:
+    room = com_margin(ik.kin.com[:2], support_polygon(points))
+    if room <= 0:
         return None
+    # At first the robot must not lean after the contact; where it has to, it may.
+    low, high = FEELING_MARGIN
+    for margin in (float(np.clip(room, low, high)), low):
+        nodes, depths = _nodes_below(ik, held, contact, q, free, margin)
+        if len(nodes) > 1:
+            break
+    else:
+        return None
+    phase = Phase(
+        kind="swing",
+        q=np.array(nodes),
+        contacts=held,
+        load_before=held,
+        load_after=held,
+    )
+    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).sum(axis=0).max()
+    speed = max(float(travel) * FEELING_SPEED / depths[-1], 1e-3)
+    t = build_trajectory(world, [phase], speed=speed)
+    a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
+    cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
+    return replace(t, time=t.time[: b - a], **cut)
+
+
+def _nodes_below(
+    ik: IK,
+    held: tuple[Contact, ...],
+    contact: Contact,
+    q: np.ndarray,
+    free: np.ndarray,
+    margin: float,
+) -> tuple[list[np.ndarray], list[float]]:
+    """Postures from `q` on, and how deep the contact is in each, as far as it goes."""
+    world = ik.world
     support = world.supports[contact.support]
     nodes, depths = [q], [0.0]
-    for depth in np.linspace(0.0, REACH, FEELING_NODES)[1:].tolist():
+    for depth in FEELING_DEPTHS:
         goal = ContactGoal(
             surface=contact.surface,
             support=contact.support,
@@ -239,29 +268,37 @@ def feeling(
             extra=(goal,),
             touching={contact.surface: contact.support},
             posture_weight=0.3,
-            margin=0.01,
+            margin=margin,
         )
-        problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
+        problem = replace(
+            problem,
+            ellipse_weight=0.0,
+            com_weight=0.0,
+            clearance=np.where(free, -np.inf, problem.clearance),
+        )
         solution = ik.solve(problem, nodes[-1], iterations=25)
         ik.kin.update(solution.q)
         p = ik.kin.contact_point(contact.surface, support.normal)
         short = float((p - goal.position) @ support.normal)
-        if solution.status is not Status.SOLVED or short > FOLLOWED:
+        if solution.status is not Status.SOLVED or short > min(FOLLOWED, 0.5 * depth):
             break
         nodes.append(solution.q)
         depths.append(depth)
-    if len(nodes) < 2:
-        return None
-    phase = Phase(
-        kind="swing",
-        q=np.array(nodes),
-        contacts=held,
-        load_before=held,
-        load_after=held,
-    )
-    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).sum(axis=0).max()
-    speed = max(float(travel) * FEELING_SPEED / depths[-1], 1e-3)
-    t = build_trajectory(world, [phase], speed=speed)
-    a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
-    cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
-    return replace(t, time=t.time[: b - a], **cut)
+    return nodes, depths
+
+
+def _limb_over(world: World, contact: Contact) -> np.ndarray:
+    """(P,) bool: pairs of a contact's limb with its support, believed to be lower.
+
+    The other limbs stay where the support was found to be.
+    """
+    m, limb = world.model, world.robot.limb_of(contact.surface)
+    root = world.landmark(limb.root)[0]
+    links = set()
+    for surface in limb.surfaces:
+        body = world.surfaces[surface].body
+        while body not in (0, root):
+            links.add(body)
+            body = int(m.body_parentid[body])
+    mine = np.isin(m.geom_bodyid[world.pairs], list(links)).any(axis=1)
+    return mine & (world.pairs == world.support_geom[contact.support]).any(axis=1)
