@@ -47,6 +47,9 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	rm -rf build/climb
 	$(BIN)/clamber climb --out build/climb
 	cp build/climb/climb.png docs/climb.png
+	$(BIN)/clamber learn crossing --out build/policy/policy.json
+	cp build/policy/policy.png docs/policy.png
+	cp build/policy/policy-pelvis.png docs/policy-pelvis.png
 	$(BIN)/python -c 'from clamber.viz import cost_shapes; cost_shapes("docs/cost-shapes.png")'
 
 experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)

@@ -49,6 +49,7 @@ LAYERS = [
     "execution",
     "simulation",
     "alternatives",
+    "contraction",
     "job",
     "success",
     "experiment",
@@ -57,6 +58,7 @@ LAYERS = [
     "export",
     "viz",
     "curves",
+    "policy_plots",
     "view",
     "report",
     "",  # the package itself: its public names

@@ -2,6 +2,7 @@ from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
 from clamber.contact import Stance as Stance
+from clamber.contraction import learn_policy as learn_policy
 from clamber.curves import save_curves as save_curves
 from clamber.demo import Demonstration as Demonstration
 from clamber.demo import load_demo as load_demo
@@ -57,6 +58,7 @@ from clamber.simulation import simulate as simulate
 from clamber.sweep import load_sweep as load_sweep
 from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
+from clamber.traverse import plan_traverse as plan_traverse
 from clamber.viz import render_run as render_run
 
 __version__: str

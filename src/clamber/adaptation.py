@@ -34,7 +34,9 @@ REACH = 0.12  # [m] a contact is looked for this far from where it was planned
 FEELING_SPEED = 0.06  # [m/s] along the normal
 FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
 FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
-HORIZON = 6  # contact changes that a policy is followed ahead; then it goes on from there
+HORIZON = (
+    6  # contact changes that a policy is followed ahead; then it goes on from there
+)
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
@@ -163,7 +165,9 @@ def _rest(
             sequence = retarget(plan.sequence, world)
         except InputError as e:
             missed = str(e)
-            return Adapted(world=world, trajectory=None, keyframes=(key,), missed=missed)
+            return Adapted(
+                world=world, trajectory=None, keyframes=(key,), missed=missed
+            )
         steps = _from_here(split_moves(sequence, world)[0][made:], key, world)
         found, _ = search_steps(ik, steps, plan.options, start=key)
         missed = found.missed[0].reason if found.missed else ""

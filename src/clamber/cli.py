@@ -231,7 +231,7 @@ class ClimbCommand:
     """The whole job: detect contacts, plan, simulate; all files in one run folder."""
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
-    """A recording, or the built-in demonstration (climb)."""
+    """A recording, or a built-in demonstration (climb, crossing)."""
     fit_floor: bool = False
     """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
@@ -344,6 +344,62 @@ class PlanCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TraverseCommand:
+    """Cross a scene with a general policy: plan, then simulate."""
+
+    policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    """A policy.json, as `clamber learn` writes it."""
+    scene: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """A scene.yaml."""
+    robot: str = "coman"
+    """A built-in robot by name, or a robot.yaml."""
+    planning: Annotated[PlanningFlags, Flat]
+    max_changes: int = _default("pipeline", "PlanOptions", "max_changes")
+    """Contact changes at most."""
+    execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
+    video: bool = False
+    """Draw a video too, not pictures alone."""
+    out: Place = None
+    """The run folder (runs/traverse, then runs/traverse-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Policy to verdict."""
+        if self.max_changes < 1:
+            raise InputError(
+                "1 or more", source="--max-changes", value=self.max_changes
+            )
+        policy = clamber.load_policy(self.policy)
+        scene = clamber.load_scene(self.scene)
+        robot = clamber.load_robot(self.robot)
+        options = clamber.PlanOptions(
+            **asdict(self.planning), max_changes=self.max_changes
+        )
+        clock = Clock()
+        world = WorldFlags(robot=self.robot, scene=self.scene)
+        with self.output.progress() as show:
+            report = clock.watching(show)
+            with world.blamed():
+                plan = clamber.plan_traverse(
+                    policy, robot, scene, options=options, progress=report
+                )
+            folder = clamber.new_run_folder(self.out, "traverse")
+            clamber.save_plan(plan, folder)
+            done = None
+            if plan.complete:
+                done = self.execution.simulate(plan, folder, report, None)
+            missing = ""
+            try:
+                clamber.render_run(folder, with_video=self.video, report=report)
+            except ClamberError as e:  # the robot has crossed all the same
+                missing = str(e)
+            _save_timings(folder, clock)
+        if missing and not self.output.quiet:
+            sys.stderr.write(f"clamber: {missing}\n")
+        return _conclude(self.output, folder, plan, done, clock)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SimulateCommand:
     """Run a plan in physics: rollout.npz, verdict.json."""
 
@@ -364,6 +420,100 @@ class SimulateCommand:
             )
             _save_timings(self.run_folder, clock)
         return _conclude(self.output, self.run_folder, plan, done)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnCommand:
+    """Learn the general policy of demonstrations: policy.json and its pictures."""
+
+    demonstrations: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="RECORDING|SEQUENCE|NAME"),
+    ]
+    """Recordings, sequence.json files, or built-in demonstrations (crossing)."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE", help_behavior_hint="(default: runs/learn/policy.json)"
+        ),
+    ] = None
+    """The policy's file; pictures are written beside it."""
+    output: Printed
+
+    def run(self) -> int:
+        """Demonstrations to a policy."""
+        from clamber.io import POLICY, policy_summary
+        from clamber.policy_plots import save_pictures
+
+        if not self.demonstrations:
+            raise InputError("at least one demonstration, such as crossing")
+        if self.out is not None and self.out.suffix != ".json":
+            raise InputError(
+                "a file that ends in .json", source="--out", value=str(self.out)
+            )
+        with self.output.progress() as report:
+            sequences = []
+            for k, name in enumerate(self.demonstrations):
+                report("detect", k / len(self.demonstrations), name)
+                sequences.append(_sequence(name))
+            report("detect", 1.0, "")
+            policy = clamber.learn_policy(sequences)
+            folder = clamber.new_run_folder(self.out and self.out.parent, "learn")
+            file = self.out or folder / POLICY
+            clamber.save_policy(policy, file)
+            report("draw", 0.0, "")
+            pictures = save_pictures(policy, file)
+            report("draw", 1.0, "")
+        record = {
+            "out": str(file),
+            "pictures": [str(p) for p in pictures],
+            **policy_summary(policy),
+        }
+        tables, notes = [], [*policy.notes]
+        for k, one in enumerate((policy, *policy.secondary)):
+            tables += _policy_tables(one, f"secondary {k}" if k else "")
+            notes += one.notes if k else ()
+            if k:
+                notes.append(f"secondary {k}: {', '.join(one.sources)}")
+        note = "\n".join([*notes, f"the policy is in {file}"])
+        self.output.show(record, *tables, note=note)
+        return REACHED
+
+
+def _sequence(name: str) -> clamber.ContactSequence:
+    """The contact sequence of a file, or what is detected in a recording."""
+    path = Path(name)
+    if path.suffix == ".json" or path.is_dir():
+        return clamber.load_sequence(path)
+    return clamber.detect_contacts(clamber.load_demo(name))
+
+
+def _policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
+    """Options, and how the pelvis is held."""
+    options = _table(
+        " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
+        "until",
+    )  # fmt: skip
+    for o in policy.options:
+        options.add_row(
+            o.name, o.region, ", ".join(o.surfaces), str(o.repeats),
+            " ".join(o.initiation), o.termination,
+        )  # fmt: skip
+    pelvis = _table("pelvis", "angle", "mean [deg]", "sigma [deg]", "imposed [deg]")
+    for place, d in (("near edge", policy.near_edge), ("over top", policy.over_top)):
+        for k, angle in enumerate(("roll", "pitch", "yaw")):
+            imposed = d.imposed[k]
+            pelvis.add_row(
+                "" if k else f"{place} ({d.samples})",
+                angle,
+                f"{math.degrees(d.mean[k]):.1f}",
+                f"{math.degrees(d.sigma[k]):.1f}",
+                "-"
+                if imposed is None
+                else " to ".join(f"{math.degrees(x):.1f}" for x in imposed),
+            )
+    return [options, pelvis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -587,7 +737,9 @@ Command = (
     Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
+    | Annotated[TraverseCommand, tyro.conf.subcommand("traverse")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]

@@ -512,7 +512,7 @@ class _DemoFile(pydantic.BaseModel):
     scene: _SceneFile
     subject: dict[str, float]
     states: list[_StateOfFile]
-    actions: tuple[str, ...]
+    actions: tuple[str | None, ...]
 
     def demo(self) -> DemoPolicy:
         return DemoPolicy(
@@ -565,6 +565,14 @@ class _GeneralFile(pydantic.BaseModel):
                 ),
             ),
         )
+
+
+def policy_summary(policy: GeneralPolicy) -> dict[str, Any]:
+    """A general policy in plain numbers and words, without its demo policies."""
+    summary = {k: v for k, v in policy_fields(policy).items() if k != "demos"}
+    summary["sources"] = policy.sources
+    summary["secondary"] = [policy_summary(s) for s in policy.secondary]
+    return _plain(summary)
 
 
 def policy_fields(policy: GeneralPolicy) -> dict[str, Any]:

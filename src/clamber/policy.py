@@ -43,22 +43,22 @@ class DemoPolicy:
         subject: Segment lengths of the person by name [m].
         states: N + 1; the last one is the goal.
         actions: N; action i is taken in state i and leads to state i + 1: the surface
-            that makes a contact or moves it.
+            that makes a contact or moves it. None where contacts are given up alone.
     """
 
     source: str
     scene: Scene
     subject: Mapping[str, float]
     states: tuple[Stance, ...]
-    actions: tuple[str, ...]
+    actions: tuple[str | None, ...]
 
     def __post_init__(self) -> None:
         """Check that there is one more state than actions, and the surfaces."""
         if len(self.states) != len(self.actions) + 1:
             raise ValueError("one more state than there are actions")
-        _check_surfaces(self.actions)
+        _check_surfaces(tuple(a for a in self.actions if a is not None))
         for action, after in zip(self.actions, self.states[1:], strict=True):
-            if after.contact(action) is None:
+            if action is not None and after.contact(action) is None:
                 raise ValueError(f"action {action} leads to a state without it")
         object.__setattr__(self, "subject", MappingProxyType(dict(self.subject)))
 

@@ -16,8 +16,12 @@ from clamber.errors import InputError
 from clamber.policy import Edge
 from clamber.scene import GROUND, GROUND_HALF_SIZE, Scene, Support
 
-GAP = 0.30  # [m] a narrower gap is crawled across; in a wider one there is room to stand
-BESIDE = 0.25  # [m] a gate keeps so far from the ends of its edge, where it is that long
+GAP = (
+    0.30  # [m] a narrower gap is crawled across; in a wider one there is room to stand
+)
+BESIDE = (
+    0.25  # [m] a gate keeps so far from the ends of its edge, where it is that long
+)
 BORDER = 0.02  # [m] contacts stay so far inside a top's border
 GRID = 0.02  # [m] of the search for a place
 SPAN = 0.24  # [m] a place is looked for this far around where it is wanted

@@ -13,15 +13,14 @@ reversed, is where a move of the descent is looked for.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from clamber.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError
-from clamber.model import Kinematics, Robot, World, build_world
+from clamber.model import Robot, World, build_world
 from clamber.moves import Guide, Move, Skipped, Step
 from clamber.path import Path
 from clamber.pipeline import (
@@ -138,7 +137,7 @@ class _Task:
 _Made = tuple[Keyframe, Path, str]
 
 
-def traverse(
+def plan_traverse(
     policy: GeneralPolicy,
     robot: Robot,
     scene: Scene,
@@ -295,8 +294,10 @@ def _on_feet(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
 
 
 def _passed(platform: Platform, xy: np.ndarray) -> bool:
-    return platform.exit is not None and platform.exit.distance(xy) < 0 and (
-        platform.entry.distance(xy) > 0
+    return (
+        platform.exit is not None
+        and platform.exit.distance(xy) < 0
+        and (platform.entry.distance(xy) > 0)
     )
 
 
@@ -433,16 +434,12 @@ def _left_of(
         for i, (step, _) in enumerate(rows):
             makes = step.move.makes
             if step.move.limb == limb and makes and makes.surface == surface:
-                done += [
-                    j for j in range(i + 1) if rows[j][0].move.limb == limb
-                ]
+                done += [j for j in range(i + 1) if rows[j][0].move.limb == limb]
     left = [i for i in range(len(rows)) if i not in done]
     return [rows[i][0] for i in left], [rows[i][1] for i in left]
 
 
-def _descent(
-    task: _Task, platform: Platform
-) -> list[tuple[Step, str]] | str:
+def _descent(task: _Task, platform: Platform) -> list[tuple[Step, str]] | str:
     """The ascent from behind the far edge with its steps reversed, or why not."""
     edge = platform.exit
     assert edge is not None
@@ -463,9 +460,7 @@ def _descent(
         made = t.move.makes
         assert made is not None
         before = t.leaving[0] if t.leaving else None
-        move = Move(
-            limb=t.move.limb, breaks=(made.surface,), makes=before, firm=True
-        )
+        move = Move(limb=t.move.limb, breaks=(made.surface,), makes=before, firm=True)
         guide = Guide(shifted=t.touching, touching=t.shifted)
         reference = home if before is None else None
         out.append(
@@ -667,9 +662,7 @@ def _attempt(
         contact = _contact(
             world, surface, Place(support=place.support, position=position), body.yaw
         )
-        move = Move(
-            limb=limb.name, breaks=(here.surface,), makes=contact, firm=True
-        )
+        move = Move(limb=limb.name, breaks=(here.surface,), makes=contact, firm=True)
         step = Step(
             stance=0,
             target=Stance(contacts=()),
@@ -723,9 +716,7 @@ def _contact(world: World, surface: str, place: Place, yaw: float) -> Contact:
     )
 
 
-def _place(
-    task: _Task, platform: Platform, surface: str, wanted: np.ndarray
-) -> Place:
+def _place(task: _Task, platform: Platform, surface: str, wanted: np.ndarray) -> Place:
     """Where on the platform a surface can rest, nearest to `wanted` (2,)."""
     world = task.ik.world
     beside = world.surfaces[surface].radius + CLEAR
@@ -834,9 +825,7 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
     soles = [kin.contact_point(x.surfaces[0], up)[:2] for x in legs]
     leg, arm = length[legs[0].name], length[arms[0].name]
     thigh = float(
-        np.linalg.norm(
-            kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1]
-        )
+        np.linalg.norm(kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1])
     )
     return _Build(
         step=step,

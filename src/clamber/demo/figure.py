@@ -69,24 +69,24 @@ def settle(wanted: np.ndarray, held: Held, *, trunk: bool) -> np.ndarray:
     soft = np.array([3.0] * 3 + [1.0] * 3 + [3.0] * 3 + [1.0] * 3)
 
     def residual(x: np.ndarray) -> np.ndarray:
-        chord = np.linalg.norm(x[:, 6:9] - x[:, 0:3], axis=1)
         rows = [soft * (x - wanted)]
         if trunk:
+            chord = np.linalg.norm(x[..., 6:9] - x[..., 0:3], axis=-1)
             bent = np.clip(chord, 0.9 * TRUNK, TRUNK)  # a rounded back is shorter
-            rows.append(8.0 * (chord - bent)[:, None])
+            rows.append(8.0 * (chord - bent)[..., None])
         for name, point, length in held.exact:
-            d = np.linalg.norm(joint_of(x, name) - point, axis=1) - length
-            rows.append(1e3 * d[:, None])
+            rows.append(1e3 * _beyond(x, name, point, length)[..., None])
         for name, point, length in held.within:
-            d = np.linalg.norm(joint_of(x, name) - point, axis=1) - length
-            rows.append(1e3 * np.maximum(d, 0.0)[:, None])
-        return np.concatenate(rows, axis=1)
+            d = _beyond(x, name, point, length)
+            rows.append(1e3 * np.maximum(d, 0.0)[..., None])
+        return np.concatenate(rows, axis=-1)
 
     x = wanted.copy()
-    step = 1e-6 * np.eye(12)
+    step = 1e-6 * np.concatenate([np.zeros((1, 12)), np.eye(12)])[:, None, :]
     for _ in range(20):
-        r = residual(x)
-        J = np.stack([(residual(x + e) - r) / 1e-6 for e in step], axis=2)
+        moved = residual(x + step)  # (13, T, rows): as it is, then moved
+        r = moved[0]
+        J = np.stack(list((moved[1:] - r) / 1e-6), axis=2)
         H = J.transpose(0, 2, 1) @ J
         g = np.einsum("tri,tr->ti", J, r)
         change = np.linalg.solve(H, g[:, :, None])[:, :, 0]
@@ -94,6 +94,11 @@ def settle(wanted: np.ndarray, held: Held, *, trunk: bool) -> np.ndarray:
         if np.abs(change).max() < 1e-10:
             break
     return x
+
+
+def _beyond(x: np.ndarray, name: str, point: np.ndarray, length: float) -> np.ndarray:
+    """How much farther than `length` a joint of bodies (..., 12) is from a point."""
+    return np.linalg.norm(joint_of(x, name) - point, axis=-1) - length
 
 
 def sway(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
