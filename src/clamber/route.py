@@ -1,7 +1,8 @@
 """Scene -> what lies between start and goal, and where a contact can be made on it.
 
 Along the straight line from start to goal, boxes that are close together make one
-platform, which is climbed up at one edge and, unless the goal is on it, down at another.
+platform, which is climbed up at one edge and, unless the goal is on it, down at
+another.
 Other boxes are walls: nothing stands on them, and nothing comes close to them.
 """
 
@@ -155,7 +156,7 @@ def _edge(top: Support, start: np.ndarray, goal: np.ndarray, share: float) -> Ed
 def find_place(
     scene: Scene, boxes: tuple[str, ...], wanted: np.ndarray, beside: float
 ) -> Place | None:
-    """The place nearest to `wanted` (2,) on the tops of some boxes; None: there is none.
+    """The place nearest to `wanted` (2,) on the tops of some boxes; None: nowhere.
 
     Args:
         scene: With all of its boxes.

@@ -7,8 +7,8 @@ comes next is read off the stance alone, so that a plan can go on from any stanc
 is felt.
 
 The way down is a way up: a climb that is statically stable is so backwards as well. The
-ascent is planned from where the robot will stand behind the far edge; each of its moves,
-reversed, is where a move of the descent is looked for.
+ascent is planned from where the robot will stand behind the far edge; each of its
+moves, reversed, is where a move of the descent is looked for.
 """
 
 from __future__ import annotations
@@ -49,12 +49,13 @@ from clamber.se3 import matrix_from_quat, quat_from_matrix
 from clamber.search import home_at, plan_step, standing
 from clamber.trajectory import build_trajectory
 
-STEPS = 3.0  # f of (5.9): a step is this part of what a limb reaches
+STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
 TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
 SHRUNK = (1.0, 0.6, 0.3)  # a step that fails is tried shorter
 SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
+NEARLY = 0.12  # [m] ... where it gets no nearer, it may climb down from here
 FACING = 0.15  # [rad] from how it shall face
 # Where the body stands before an edge, in lengths of its legs, and what may differ.
 STAND, STAND_TOL = 0.54, 0.12
@@ -62,7 +63,7 @@ BESIDE_TOL = 0.10  # [m] along the edge
 REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
-LEAN = np.radians(80.0)  # of the trunk on all fours, where the policy imposes none
+LEAN = np.radians(80.0)  # of the trunk on all fours
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
@@ -241,7 +242,7 @@ def _follow(task: _Task, key: Keyframe, changes: int, report: Progress) -> Follo
 
 
 def cost_to_go(stance: Sequence[Contact], goal: np.ndarray) -> float:
-    """Distance from the mean of all contacts to the goal (2,) [algorithm 3, step 11]."""
+    """From the mean of all contacts to the goal (2,) [m] [algorithm 3, step 11]."""
     middle = np.mean([c.position[:2] for c in stance], axis=0)
     return float(np.linalg.norm(goal - middle))
 
@@ -533,7 +534,10 @@ def _on_fours(
     wanted = _behind(task, platform.exit)
     if _there(frame, wanted):
         return _climb_down(task, key, platform)
-    return _crawl(task, key, platform, frame, wanted)
+    made, why = _crawl(task, key, platform, frame, wanted)
+    if not made and np.linalg.norm(frame.xy - wanted.xy) <= NEARLY:
+        return _climb_down(task, key, platform)
+    return made, why
 
 
 def _behind(task: _Task, edge: Edge) -> _Frame:
@@ -595,30 +599,78 @@ def _crawl(
     why = ""
     for body in tries:
         made: list[_Made] = []
-        now = key
         left = list(_leading_first(task, option, frame, full))
         # What cannot move yet is tried again once the others have, and then shorter.
-        for shares in (SHRUNK[:1], SHRUNK):
-            for surface in tuple(left):
-                limb = task.ik.world.robot.limb_of(surface)
-                here = _by_limb(task, now.stance)[limb.name]
-                at = body.at(task.build.fours[limb.name])
-                place = _place(task, platform, surface, at)
-                if np.linalg.norm(place.position - here.position) < SAME:
-                    left.remove(surface)
-                    continue
-                found = _attempt(
-                    task, now, surface, here, place, body, task.fours, shares
-                )
-                if isinstance(found, str):
-                    why = found
-                    continue
-                now, path = found
-                made.append((now, path, option.name))
-                left.remove(surface)
+        left, why = _cycle(task, key, platform, option, body, left, made, first=True)
+        if left:
+            now = made[-1][0] if made else key
+            left, why = _cycle(task, now, platform, option, body, left, made)
+        if left and made:
+            # The others have gone too far ahead: around the first that is left behind
+            # they stand again as they should, and it may follow.
+            stuck, now = left[0], made[-1][0]
+            limb = task.ik.world.robot.limb_of(stuck).name
+            here = _by_limb(task, now.stance)[limb].position[:2]
+            back = here - _turn(body.yaw) @ task.build.fours[limb]
+            others = [s for s in option.surfaces if s != stuck]
+            around = _Frame(back, body.yaw)
+            _cycle(task, now, platform, option, around, others, made)
+            left, why = _cycle(task, made[-1][0], platform, option, body, [stuck], made)
+            if left:
+                return [], why
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
+
+
+def _cycle(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    body: _Frame,
+    surfaces: Sequence[str],
+    made: list[_Made],
+    *,
+    first: bool = False,
+) -> tuple[list[str], str]:
+    """Move some contacts of a cycle; those that cannot be, and why the last of them.
+
+    Args:
+        task: What does not change.
+        key: Where to go on from.
+        platform: On which.
+        option: The cycle.
+        body: Where the body shall get to.
+        surfaces: To move, in order.
+        made: Receives what was found.
+        first: All the way or not at all, the pelvis as the policy has it.
+    """
+    left, why = [], ""
+    for surface in surfaces:
+        limb = task.ik.world.robot.limb_of(surface).name
+        here = _by_limb(task, key.stance)[limb]
+        place = _place(task, platform, surface, body.at(task.build.fours[limb]))
+        if np.linalg.norm(place.position - here.position) < SAME:
+            continue
+        found = _attempt(
+            task,
+            key,
+            surface,
+            here,
+            place,
+            body,
+            task.fours,
+            shares=SHRUNK[:1] if first else SHRUNK,
+            imposed=first,
+        )
+        if isinstance(found, str):
+            left.append(surface)
+            why = found
+            continue
+        key, path = found
+        made.append((key, path, option.name))
+    return left, why
 
 
 def _leading_first(
@@ -647,7 +699,9 @@ def _attempt(
     place: Place,
     body: _Frame,
     reference: np.ndarray | None,
+    *,
     shares: Sequence[float] = SHRUNK,
+    imposed: bool = True,
 ) -> tuple[Keyframe, Path] | str:
     """Move one contact to a place, or part of the way there; or why not."""
     world = task.ik.world
@@ -667,7 +721,7 @@ def _attempt(
             stance=0,
             target=Stance(contacts=()),
             move=move,
-            base_rotation=_pelvis(task, key, body),
+            base_rotation=_pelvis(task, key, body) if imposed else None,
             reference=reference,
         )
         found = plan_step(
@@ -687,7 +741,10 @@ def _attempt(
 def _pelvis(task: _Task, key: Keyframe, body: _Frame) -> np.ndarray | None:
     """(3, 3) how the pelvis should be held [algorithm 3, step 14]; None on the ground.
 
-    As it is, turned the way that the body faces, within what the policy imposes.
+    As it is, turned the way that the body faces, its roll within what the policy
+    imposes. Pitch is left to the robot: a person, whose thighs are longer than the
+    upper arms, crawls with the hips high, and a robot of another build that is held so
+    has its weight on its elbows and cannot lift them.
     """
     platform = _platform_of(task, key.stance)
     if platform is None:
@@ -701,7 +758,7 @@ def _pelvis(task: _Task, key: Keyframe, body: _Frame) -> np.ndarray | None:
     )
     angles = pelvis_angles(R)
     if held is not None:
-        angles = held.clip(angles)
+        angles[0] = held.clip(angles)[0]
     return pelvis_rotation(np.array([angles[0], angles[1], body.yaw]))
 
 
@@ -767,9 +824,7 @@ def _posture_on_fours(ik: IK, policy: GeneralPolicy, build: _Build) -> np.ndarra
         xy = frame.at(build.fours[world.robot.limb_of(surface).name])
         place = Place(support=GROUND, position=np.array([*xy, 0.0]))
         up[surface] = _contact(world, surface, place, frame.yaw)
-    lean = policy.over_top.imposed[1]
-    pitch = 0.5 * sum(lean) if lean is not None else LEAN
-    held = pelvis_rotation(np.array([0.0, pitch, frame.yaw]))
+    held = pelvis_rotation(np.array([0.0, LEAN, frame.yaw]))
     q = world.home.copy()
     q[3:7] = quat_from_matrix(held)
     q[2] *= 0.7
@@ -778,7 +833,6 @@ def _posture_on_fours(ik: IK, policy: GeneralPolicy, build: _Build) -> np.ndarra
         q_reference=world.home,
         clearance=_own_clearance(world),
         base_rotation=held,
-        base_weight=1.0,
     )
     return ik.solve_hard(problem, q).q
 
@@ -809,8 +863,8 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
     )
     step = {}
     for x in limbs:
-        reach = [policy.reach[s] for s in x.surfaces if s in policy.reach]
-        step[x.name] = min(max(reach, default=1.0), 1.0) * length[x.name] / STEPS
+        shown = [policy.reach[s] for s in x.surfaces if s in policy.reach]
+        step[x.name] = min(1.0 / STEPS, max(shown, default=1.0)) * length[x.name]
     half = {
         kind: 0.5 * abs(float(root[a.name][1] - root[b.name][1]))
         for kind, (a, b) in (("arm", arms), ("leg", legs))
