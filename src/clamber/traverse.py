@@ -28,7 +28,6 @@ from clamber.pipeline import (
     Plan,
     PlanOptions,
     Progress,
-    check_reach,
     check_start,
     search_steps,
 )
@@ -110,6 +109,7 @@ class _Build:
         feet: Half the distance between the feet.
         stand: From the feet to an edge that is to be climbed [m].
         reach: From the feet to an edge, at most [m].
+        tall: Height that hands reach, standing [m].
         thigh: [m]
     """
 
@@ -118,6 +118,7 @@ class _Build:
     feet: float
     stand: float
     reach: float
+    tall: float
     thigh: float
 
 
@@ -887,6 +888,7 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
         feet=0.5 * float(np.linalg.norm(soles[0] - soles[1])),
         stand=STAND * leg,
         reach=STAND * leg + REACH * arm,
+        tall=leg + trunk + arm,
         thigh=thigh,
     )
 
@@ -905,6 +907,15 @@ def _check_route(task: _Task) -> None:
             field="policy.options",
             value=regions,
         )
+    for name in (b for p in task.platforms for b in p.boxes):
+        top = float(world.supports[name].position[2])
+        if top > task.build.tall:
+            raise InputError(
+                f"a top within {task.build.tall:.2f} m, what the robot reaches, between"
+                " start and goal",
+                field=f"scene.boxes.{name}",
+                value=f"{top:.2f} m high",
+            )
     if not task.platforms:
         return
     first = task.platforms[0].entry
@@ -917,4 +928,3 @@ def _check_route(task: _Task) -> None:
             field=f"scene.boxes.{task.platforms[0].boxes[0]}",
             value=f"{away:.2f} m away",
         )
-    check_reach(task.ik)
