@@ -13,6 +13,7 @@ moves, reversed, is where a move of the descent is looked for.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,7 +39,6 @@ from clamber.policy import (
     pelvis_angles,
     pelvis_distribution,
     pelvis_rotation,
-    wrap,
 )
 from clamber.posture.ik import IK, PostureProblem
 from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
@@ -284,7 +284,7 @@ def _on_feet(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
         near = (
             abs(local[0]) <= STAND_TOL * task.build.stand / STAND
             and abs(local[1]) <= BESIDE_TOL
-            and abs(wrap(frame.yaw - wanted.yaw)) <= FACING
+            and abs(_apart(frame.yaw, wanted.yaw)) <= FACING
         )
         if near:
             return _climb_up(task, key, ahead.entry, ahead)
@@ -310,7 +310,7 @@ def _before(task: _Task, edge: Edge) -> _Frame:
 
 def _there(frame: _Frame, wanted: _Frame) -> bool:
     away = float(np.linalg.norm(frame.xy - wanted.xy))
-    return away <= ARRIVED and abs(wrap(frame.yaw - wanted.yaw)) <= FACING
+    return away <= ARRIVED and abs(_apart(frame.yaw, wanted.yaw)) <= FACING
 
 
 def _feet_frame(task: _Task, stance: Sequence[Contact]) -> _Frame:
@@ -334,7 +334,7 @@ def _walk(
     step = min(task.build.step[x.name] for x in legs)
     body = _between(frame, wanted, step, STEP_TURN)
     side = _turn(frame.yaw).T @ (body.xy - frame.xy)
-    turn = float(wrap(body.yaw - frame.yaw))
+    turn = _apart(frame.yaw, body.yaw)
     left_first = side[1] + task.build.feet * turn > 0
     legs.sort(key=lambda x: x.name.startswith("left") != left_first)
     made: list[_Made] = []
@@ -357,14 +357,8 @@ def _walk(
 
 def _home(task: _Task, body: _Frame) -> np.ndarray:
     """(nq,) the posture that the robot starts from, over the feet."""
-    world = task.ik.world
-    kin = task.ik.kin
-    kin.update(world.home)
-    legs = [x.surfaces[0] for x in world.robot.limbs.values() if not x.is_arm]
-    up = np.array([0.0, 0.0, 1.0])
-    feet = np.mean([kin.contact_point(s, up)[:2] for s in legs], axis=0)
-    ahead = _turn(world.scene.start[2]).T @ (feet - world.scene.start[:2])
-    return home_at(world, np.array([*body.at(-ahead), body.yaw]))
+    ahead = _home_ahead(task)
+    return home_at(task.ik.world, np.array([*body.at(-ahead), body.yaw]))
 
 
 # Up and down.
@@ -572,7 +566,7 @@ def _crawl_step(task: _Task) -> float:
 
 def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
     """One cycle from `a` towards `b`: the way first, the turn as late as it can be."""
-    way, angle = b.xy - a.xy, float(wrap(b.yaw - a.yaw))
+    way, angle = b.xy - a.xy, _apart(a.yaw, b.yaw)
     away = float(np.linalg.norm(way)) / step
     turns = abs(angle) / turn
     cycles = max(away, turns, 1.0)
@@ -783,6 +777,11 @@ def _place(task: _Task, platform: Platform, surface: str, wanted: np.ndarray) ->
         return place
     top = world.supports[platform.boxes[0]]
     return Place(support=top.name, position=top.project(np.array([*wanted, 0.0])))
+
+
+def _apart(a: float, b: float) -> float:
+    """From one yaw to another, the short way [rad]."""
+    return math.remainder(b - a, 2.0 * math.pi)
 
 
 def _turn(yaw: float) -> np.ndarray:
