@@ -236,8 +236,9 @@ def feeling(
         load_before=held,
         load_after=held,
     )
-    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).sum(axis=0).max()
-    speed = max(float(travel) * FEELING_SPEED / depths[-1], 1e-3)
+    # No part of the way is faster than it should be, however far its nodes are apart.
+    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).max(axis=1)
+    speed = max(FEELING_SPEED * float((travel / np.diff(depths)).min()), 1e-3)
     t = build_trajectory(world, [phase], speed=speed)
     a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
     cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
