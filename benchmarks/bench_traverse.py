@@ -2,8 +2,8 @@
 
     python benchmarks/bench_traverse.py policy.json 0.5 1 2 4 8
 
-Prints, for each length [m]: contact changes, CPU seconds, milliseconds a change, and the
-peak memory of the process so far.
+Prints, for each length [m]: contact changes, CPU seconds, milliseconds a change, and
+the peak memory of the process so far.
 """
 
 from __future__ import annotations
