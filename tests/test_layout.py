@@ -47,6 +47,8 @@ LAYERS = [
     "pipeline",
     "exploration",
     "checkup",
+    "route",
+    "traverse",
     "control",
     "terrain",
     "adaptation",

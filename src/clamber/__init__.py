@@ -76,6 +76,7 @@ _HOME = {
     "plan": "pipeline",
     "plan_cost": "alternatives",
     "plan_or_replan": "alternatives",
+    "plan_traverse": "traverse",
     "propose_robot": "proposal",
     "render_run": "viz",
     "replan": "alternatives",

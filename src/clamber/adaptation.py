@@ -29,10 +29,15 @@ from clamber.search import standing
 from clamber.statics import com_margin, support_polygon
 from clamber.trajectory import HOLD_END, HOLD_START, RATE, Trajectory, build_trajectory
 from clamber.transition import balance_problem
+from clamber.traverse import follow_policy
 
 REACH = 0.12  # [m] a contact is looked for this far from where it was planned
 FEELING_SPEED = 0.06  # [m/s] along the normal
-FEELING_NODES = 9  # postures on the way
+FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
+FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
+HORIZON = (
+    6  # contact changes that a policy is followed ahead; then it goes on from there
+)
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
@@ -46,6 +51,7 @@ class Adapted:
         keyframes: The present stance first; one more for each step.
         paths: Between them.
         missed: Why steps are missing; empty where none is.
+        more: A policy goes on from the last keyframe.
     """
 
     world: World
@@ -53,6 +59,7 @@ class Adapted:
     keyframes: tuple[Keyframe, ...]
     paths: tuple[Path, ...] = ()
     missed: str
+    more: bool = False
 
 
 def felt_contact(kin: Kinematics, c: Contact) -> Contact:
@@ -155,23 +162,40 @@ def start_again(plan: Plan, scene: Scene) -> Adapted:
     return _rest(plan, ik, 0, standing(ik, plan.options.keyframe), ())
 
 
+def go_on(plan: Plan, world: World, key: Keyframe) -> Adapted:
+    """A policy followed on from the last keyframe of what was planned ahead."""
+    return _rest(plan, IK(world), 0, key, ())
+
+
 def _rest(
     plan: Plan, ik: IK, made: int, key: Keyframe, lead: tuple[Phase, ...]
 ) -> Adapted:
-    """The steps after the first `made`, from a keyframe that `lead` leads to."""
-    world = ik.world
-    try:
-        sequence = retarget(plan.sequence, world)
-    except InputError as e:
-        return Adapted(world=world, trajectory=None, keyframes=(key,), missed=str(e))
-    steps = from_here(split_moves(sequence, world)[0][made:], key.stance, world)
-    found, _ = search_steps(ik, steps, plan.options, start=key)
+    """The steps after the first `made`, from a keyframe that `lead` leads to.
+
+    A policy needs no count: it is followed from the stance, some steps ahead.
+    """
+    world, more = ik.world, False
+    if plan.policy is not None:
+        found = follow_policy(ik, plan.policy, key, plan.options, HORIZON)
+        missed, more = found.missed, not (found.arrived or found.missed)
+    else:
+        try:
+            sequence = retarget(plan.sequence, world)
+        except InputError as e:
+            missed = str(e)
+            return Adapted(
+                world=world, trajectory=None, keyframes=(key,), missed=missed
+            )
+        steps = from_here(split_moves(sequence, world)[0][made:], key.stance, world)
+        found, _ = search_steps(ik, steps, plan.options, start=key)
+        missed = found.missed[0].reason if found.missed else ""
     return Adapted(
         world=world,
         trajectory=timed(world, found.paths, plan.options.speed, lead),
         keyframes=found.keyframes,
         paths=found.paths,
-        missed=found.missed[0].reason if found.missed else "",
+        missed=missed,
+        more=more,
     )
 
 
@@ -202,24 +226,53 @@ def feeling(
         As far as can be reached, at most `REACH`; None where that is nowhere, or the
         others do not balance the robot alone.
     """
-    lower = tuple(
-        replace(b, position=b.position - REACH * b.top.normal)
-        if b.name == contact.support
-        else b
-        for b in world.scene.boxes
-    )
-    world = build_world(world.robot, replace(world.scene, boxes=lower))
     ik = IK(world)
+    free = _limb_over(world, contact)
     ik.kin.update(q)
     points = bearing_frames(ik.kin, held)[1][:, :2]
-    if com_margin(ik.kin.com[:2], support_polygon(points)) <= 0:
+    room = com_margin(ik.kin.com[:2], support_polygon(points))
+    if room <= 0:
         return None
+    # At first the robot must not lean after the contact; where it has to, it may.
+    low, high = FEELING_MARGIN
+    for margin in (float(np.clip(room, low, high)), low):
+        nodes, depths = _nodes_below(ik, held, contact, q, free, margin)
+        if len(nodes) > 1:
+            break
+    else:
+        return None
+    phase = Phase(
+        kind="swing",
+        q=np.array(nodes),
+        contacts=held,
+        load_before=held,
+        load_after=held,
+    )
+    # No part of the way is faster than it should be, however far its nodes are apart.
+    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).max(axis=1)
+    speed = max(FEELING_SPEED * float((travel / np.diff(depths)).min()), 1e-3)
+    t = build_trajectory(world, [phase], speed=speed)
+    a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
+    cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
+    return replace(t, time=t.time[: b - a], **cut)
+
+
+def _nodes_below(
+    ik: IK,
+    held: tuple[Contact, ...],
+    contact: Contact,
+    q: np.ndarray,
+    free: np.ndarray,
+    margin: float,
+) -> tuple[list[np.ndarray], list[float]]:
+    """Postures from `q` on, and how deep the contact is in each, as far as it goes."""
+    world = ik.world
     support = world.supports[contact.support]
     # Straight down from where the limb is: a round surface has rolled since its plan.
     p = ik.kin.contact_point(contact.surface, support.normal)
     top = p - support.normal * float((p - contact.position) @ support.normal)
     nodes, depths = [q], [0.0]
-    for depth in np.linspace(0.0, REACH, FEELING_NODES)[1:].tolist():
+    for depth in FEELING_DEPTHS:
         goal = ContactGoal(
             surface=contact.surface,
             support=contact.support,
@@ -235,29 +288,37 @@ def feeling(
             extra=(goal,),
             touching={contact.surface: contact.support},
             posture_weight=0.3,
-            margin=0.01,
+            margin=margin,
         )
-        problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
+        problem = replace(
+            problem,
+            ellipse_weight=0.0,
+            com_weight=0.0,
+            clearance=np.where(free, -np.inf, problem.clearance),
+        )
         solution = ik.solve(problem, nodes[-1], iterations=25)
         ik.kin.update(solution.q)
         p = ik.kin.contact_point(contact.surface, support.normal)
         short = float((p - goal.position) @ support.normal)
-        if solution.status is not Status.SOLVED or short > FOLLOWED:
+        if solution.status is not Status.SOLVED or short > min(FOLLOWED, 0.5 * depth):
             break
         nodes.append(solution.q)
         depths.append(depth)
-    if len(nodes) < 2:
-        return None
-    phase = Phase(
-        kind="swing",
-        q=np.array(nodes),
-        contacts=held,
-        load_before=held,
-        load_after=held,
-    )
-    travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).sum(axis=0).max()
-    speed = max(float(travel) * FEELING_SPEED / depths[-1], 1e-3)
-    t = build_trajectory(world, [phase], speed=speed)
-    a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
-    cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
-    return replace(t, time=t.time[: b - a], **cut)
+    return nodes, depths
+
+
+def _limb_over(world: World, contact: Contact) -> np.ndarray:
+    """(P,) bool: pairs of a contact's limb with its support, believed to be lower.
+
+    The other limbs stay where the support was found to be.
+    """
+    m, limb = world.model, world.robot.limb_of(contact.surface)
+    root = world.landmark(limb.root)[0]
+    links = set()
+    for surface in limb.surfaces:
+        body = world.surfaces[surface].body
+        while body not in (0, root):
+            links.add(body)
+            body = int(m.body_parentid[body])
+    mine = np.isin(m.geom_bodyid[world.pairs], list(links)).any(axis=1)
+    return mine & (world.pairs == world.support_geom[contact.support]).any(axis=1)

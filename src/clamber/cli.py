@@ -489,6 +489,62 @@ def _replanned_record(found: clamber.Replanned) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TraverseCommand:
+    """Cross a scene with a general policy: plan, then simulate."""
+
+    policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    """A policy.json, as `clamber learn` writes it."""
+    scene: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    """A scene.yaml."""
+    robot: str = "coman"
+    """A built-in robot by name, or a robot.yaml."""
+    planning: Annotated[PlanningFlags, Flat]
+    max_changes: int = _default("pipeline", "PlanOptions", "max_changes")
+    """Contact changes at most."""
+    execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
+    video: bool = False
+    """Draw a video too, not pictures alone."""
+    out: Place = None
+    """The run folder (runs/traverse, then runs/traverse-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Policy to verdict."""
+        if self.max_changes < 1:
+            raise InputError(
+                "1 or more", source="--max-changes", value=self.max_changes
+            )
+        policy = clamber.load_policy(self.policy)
+        scene = clamber.load_scene(self.scene)
+        robot = clamber.load_robot(self.robot)
+        options = clamber.PlanOptions(
+            **asdict(self.planning), max_changes=self.max_changes
+        )
+        clock = Clock()
+        world = WorldFlags(robot=self.robot, scene=self.scene)
+        with self.output.progress() as show:
+            report = clock.watching(show)
+            with world.blamed():
+                plan = clamber.plan_traverse(
+                    policy, robot, scene, options=options, progress=report
+                )
+            folder = clamber.new_run_folder(self.out, "traverse")
+            clamber.save_plan(plan, folder)
+            done = None
+            if plan.complete:
+                done = self.execution.simulate(plan, folder, report, None)
+            missing = ""
+            try:
+                clamber.render_run(folder, with_video=self.video, report=report)
+            except ClamberError as e:  # the robot has crossed all the same
+                missing = str(e)
+            _save_timings(folder, clock)
+        if missing and not self.output.quiet:
+            sys.stderr.write(f"clamber: {missing}\n")
+        return _conclude(self.output, folder, plan, done, clock)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SimulateCommand:
     """Run a plan in physics: rollout.npz, verdict.json."""
 
@@ -884,6 +940,7 @@ Command = (
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
     | Annotated[ReplanCommand, tyro.conf.subcommand("replan")]
+    | Annotated[TraverseCommand, tyro.conf.subcommand("traverse")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]

@@ -25,6 +25,7 @@ from clamber.adaptation import (
     adapt_plan,
     feeling,
     felt_contact,
+    go_on,
     start_again,
 )
 from clamber.contact import Contact
@@ -130,7 +131,9 @@ class Execution:
         self._ankles = _ankles(world)
         self._positioned = np.zeros(len(self._qadr))  # share of (4.32), by joint
         self._made = 0 if plan.midway is None else plan.midway.made
-        self._steps = split_moves(plan.sequence, plan.world)[0]
+        # A policy reads what comes next off the stance.
+        by_policy = plan.policy is not None
+        self._steps = () if by_policy else split_moves(plan.sequence, plan.world)[0]
         self._felt: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
         self._scale = 1.0  # of the torques: mass as felt over mass as described
         self._pose = plan.trajectory.q[0].copy()
@@ -143,7 +146,7 @@ class Execution:
         self.events: list[Event] = []
         self.stopped = ""
         self.rests_on: tuple[str, ...] = ()
-        self._adopt(plan.world, plan.trajectory, plan.keyframes, "")
+        self._adopt(plan.world, plan.trajectory, plan.keyframes, "", more=False)
         self._set(plan.trajectory, 0)
         self._behaviour = self._behave()
 
@@ -186,8 +189,13 @@ class Execution:
     def _behave(self) -> Ticks:
         yield from self._play(round(HOLD_START / PHYSICS_STEP) - 1)
         yield from self._check_start()
-        while self._leg < len(self._legs) and not self.stopped:
-            yield from self._step()
+        while not self.stopped:
+            if self._leg < len(self._legs):
+                yield from self._step()
+            elif self._more:
+                yield from self._go_ahead()
+            else:
+                break
         if self._missed and not self.stopped:
             self._stop(self._missed)
         yield from self._end()
@@ -224,6 +232,24 @@ class Execution:
         stance = self._keyframes[self._leg].stance
         self._remember([c for c in stance if self._force(c) >= LOST])
         yield from self._check_stance()
+
+    def _go_ahead(self) -> Ticks:
+        """What was planned ahead of a policy has been done: the next steps of it."""
+        key = self._keyframes[-1]
+        found = go_on(self._plan, self._world, key)
+        if found.trajectory is None:
+            self._more = False
+            if found.missed:
+                self._stop(found.missed)
+            return
+        self._adopt(
+            found.world,
+            found.trajectory,
+            found.keyframes,
+            found.missed,
+            more=found.more,
+        )
+        yield from self._play(round(HOLD_START / PHYSICS_STEP) - 1)
 
     def _take(self, made: Contact) -> Ticks:
         """A contact is made where it was not planned: the rest is planned again."""
@@ -269,8 +295,8 @@ class Execution:
     def _check_stance(self) -> Ticks:
         """At a keyframe: is every contact where it should be, and does it bear?"""
         stance = self._keyframes[self._leg].stance
-        if self._leg == len(self._legs):  # the last one: nothing depends on it
-            return
+        if self._leg == len(self._legs) and not self._more:
+            return  # the last one: nothing depends on it
         for c in stance:
             if self._force(c) >= LOST or self._other(c) is not None:
                 continue
@@ -399,14 +425,20 @@ class Execution:
             self._stop(found.missed)
             return
         self._note(f"planned again: {steps} step{'s' * (steps != 1)}")
-        self._adopt(found.world, found.trajectory, found.keyframes, found.missed)
+        self._adopt(
+            found.world,
+            found.trajectory,
+            found.keyframes,
+            found.missed,
+            more=found.more,
+        )
         self._i = round(HOLD_START / PHYSICS_STEP) - 1
-        if steps == 0:  # there is still the way to the last posture
+        if steps == 0 and not found.more:  # there is still the way to the last posture
             yield from self._play(_arrival(found.trajectory))
 
     def _go_on(self, off: float, why: str) -> Ticks:
         """No other plan was found: the one at hand may do, or may not."""
-        if self._made == len(self._steps):
+        if self._steps and self._made == len(self._steps):
             self._note(f"stays as it is ({why})")
             self._leg = len(self._legs)
         elif off < FALLBACK:
@@ -430,12 +462,14 @@ class Execution:
         trajectory: Trajectory,
         keyframes: Sequence[Keyframe],
         missed: str,
+        *,
+        more: bool,
     ) -> None:
         self._world, self._kin = world, Kinematics(world)
         self._trajectory, self._i = trajectory, 0
         self._keyframes = list(keyframes)
         self._legs, self._leg = _legs(trajectory, keyframes), 0
-        self._missed = missed
+        self._missed, self._more = missed, more
         self._return: tuple[np.ndarray, np.ndarray, int] | None = None
 
     def _note(self, text: str) -> None:

@@ -40,7 +40,7 @@ from clamber.contact import (
 from clamber.errors import InputError, Status
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
-from clamber.pipeline import Midway, Plan, PlanOptions, Skipped
+from clamber.pipeline import Iteration, Midway, Plan, PlanOptions, Skipped
 from clamber.policy import DemoPolicy, GeneralPolicy, Option, PelvisDistribution, Place
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
@@ -723,6 +723,11 @@ class _MidwayFile(pydantic.BaseModel):
         )
 
 
+class _IterationFile(pydantic.BaseModel):
+    option: str
+    cost: float
+
+
 class _PlanFile(pydantic.BaseModel):
     options: dict[str, Any]
     robot: RobotFile
@@ -732,6 +737,8 @@ class _PlanFile(pydantic.BaseModel):
     complete: bool
     midway: _MidwayFile | None = None
     instead: str = ""
+    policy: _GeneralFile | None = None
+    iterations: list[_IterationFile] = []
 
 
 class _TimingsFile(pydantic.BaseModel):
@@ -797,6 +804,9 @@ def _other_plan_fields(plan: Plan) -> dict[str, Any]:
             "contacts": [contact_fields(c) for c in plan.midway.contacts],
             "loaded": [c.surface for c in plan.midway.loaded],
         }
+    if plan.policy is not None:
+        out["policy"] = policy_fields(plan.policy)
+        out["iterations"] = [asdict(i) for i in plan.iterations]
     return out
 
 
@@ -983,6 +993,8 @@ def load_plan(folder: str | Path) -> Plan:
         timings=timings,
         midway=None if file.midway is None else file.midway.midway(),
         instead=file.instead,
+        policy=None if file.policy is None else file.policy.policy(path, "policy."),
+        iterations=tuple(Iteration(**i.model_dump()) for i in file.iterations),
     )
 
 

@@ -55,12 +55,16 @@ class Step:
         stance: Index of the stance in the sequence; `target` is it.
         move: What changes.
         guide: Where its postures may be found.
+        base_rotation: (3, 3) R_WB of the pelvis that is preferred, or None.
+        reference: (nq,) the posture to stay close to; None: the one before.
     """
 
     stance: int
     target: Stance
     move: Move
     guide: Guide = Guide()
+    base_rotation: np.ndarray | None = None
+    reference: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

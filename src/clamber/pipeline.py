@@ -17,6 +17,7 @@ from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
 from clamber.moves import Skipped, Step, split_moves
 from clamber.path import Path, Phase, overlap, watched_pairs
+from clamber.policy import GeneralPolicy
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
@@ -45,12 +46,27 @@ class PlanOptions:
         method: How contact positions are optimised.
         speed: Largest joint speed [rad/s], the thesis used 0.05; `max`: as fast as
             joints and contacts bear.
+        max_changes: Contact changes that a policy may take.
         keyframe: Options of the posture optimisation.
     """
 
     method: Method = "direct"
     speed: float | Literal["max"] = 0.3
+    max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Iteration:
+    """One action of a policy.
+
+    Attributes:
+        option: Name of the cycle that it belongs to.
+        cost: Cost-to-go after it: from the mean of the contacts to the goal [m].
+    """
+
+    option: str
+    cost: float
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -94,6 +110,8 @@ class Plan:
             climb, from its first keyframe, which is settled into.
         instead: Why it makes other contacts than the demonstrated ones, and which;
             empty where it does not.
+        policy: That it was planned with; None where it follows a demonstration.
+        iterations: Of the policy, one for each path.
     """
 
     world: World
@@ -107,6 +125,8 @@ class Plan:
     timings: dict[str, float]
     midway: Midway | None = None
     instead: str = ""
+    policy: GeneralPolicy | None = None
+    iterations: tuple[Iteration, ...] = ()
 
 
 def plan(

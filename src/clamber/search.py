@@ -14,6 +14,7 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import Status
+from clamber.model import World
 from clamber.moves import Guide, Move, Skipped, Step
 from clamber.path import Path, plan_path
 from clamber.posture import direct, gradient, lbfgs
@@ -25,7 +26,7 @@ from clamber.posture.keyframe import (
     finish,
 )
 from clamber.scene import GROUND
-from clamber.se3 import quat_from_matrix
+from clamber.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
 from clamber.transition import (
     MARGINS,
     approach_contact,
@@ -117,10 +118,19 @@ def plan_steps(
     )
 
 
-def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
-    """The first keyframe: both feet where the robot starts."""
+def standing(
+    ik: IK, options: KeyframeOptions, at: np.ndarray | None = None
+) -> Keyframe:
+    """Both feet on the ground in the posture that the robot starts from.
+
+    Args:
+        ik: Workspace.
+        options: Of the posture optimisation.
+        at: (3,) ankles' midpoint x, y [m] and yaw [rad]; None: where the robot starts.
+    """
     world, kin = ik.world, ik.kin
-    kin.update(world.home)
+    home = world.home if at is None else home_at(world, at)
+    kin.update(home)
     up = world.supports[GROUND].normal
     feet = []
     for limb in world.robot.limbs.values():
@@ -140,16 +150,30 @@ def standing(ik: IK, options: KeyframeOptions) -> Keyframe:
                 quaternion=quat_from_matrix(R),
             )
         )
-    task = KeyframeTask(held=tuple(feet), new=(), q_reference=world.home)
+    task = KeyframeTask(held=tuple(feet), new=(), q_reference=home)
     return finish(
         ik,
         task,
         options,
-        world.home,
+        home,
         method="home",
         iterations=0,
         cost_before=0.0,
     )
+
+
+def home_at(world: World, at: np.ndarray) -> np.ndarray:
+    """(nq,) the posture that the robot starts from, moved along the ground.
+
+    Args:
+        world: Robot and scene.
+        at: (3,) ankles' midpoint x, y [m] and yaw [rad].
+    """
+    start, q = world.scene.start, world.home.copy()
+    R = matrix_from_rpy(np.array([0.0, 0.0, at[2] - start[2]]))
+    q[:2] = R[:2, :2] @ (q[:2] - start[:2]) + at[:2]
+    q[3:7] = quat_from_matrix(R @ matrix_from_quat(q[3:7]))
+    return q
 
 
 def repair(
@@ -215,8 +239,9 @@ def _plan_on(
     task = KeyframeTask(
         held=held,
         new=(move.makes,) if move.makes else (),
-        q_reference=before.q,
+        q_reference=before.q if step.reference is None else step.reference,
         directions=step.target.posture,
+        base_rotation=step.base_rotation,
     )
     wanted, result = move.makes, "nothing tried"
     for there in (True, False) if move.firm else (False, True):

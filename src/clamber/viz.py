@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import functools
 import importlib.util
+import itertools
 import math
 import os
 import subprocess
@@ -57,6 +58,7 @@ PHASE_COLOURS = {
     "reach-to-supportable": (234, 179, 8),
     "sliding": (220, 38, 38),
 }
+CYCLE_COLOURS = ("#fde68a", "#bfdbfe", "#bbf7d0", "#fecaca", "#e9d5ff")  # in order
 DARK, PALE, LINE = (35, 40, 48), (248, 249, 250), (205, 209, 214)
 SURFACE_COLOURS = ("#c2410c", "#1d4ed8")  # of a limb's surfaces, the outer one first
 Report = Callable[[str, float, str], None]
@@ -676,6 +678,27 @@ def stability_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
     return save_plot(fig, path)
 
 
+def cost_to_go_plot(plan: Plan, path: str | Path) -> Path:
+    """Draw the distance left to the goal after each contact change, by cycle."""
+    fig = Figure(figsize=(7.0, 3.2), layout="constrained")
+    ax = fig.subplots()
+    names = list(dict.fromkeys(i.option for i in plan.iterations))
+    colours = dict(zip(names, itertools.cycle(CYCLE_COLOURS), strict=False))
+    labelled = set()
+    for k, i in enumerate(plan.iterations):
+        label = None if i.option in labelled else i.option
+        labelled.add(i.option)
+        ax.axvspan(k + 0.5, k + 1.5, color=colours[i.option], lw=0, label=label)
+    costs = [i.cost for i in plan.iterations]
+    ax.plot(range(1, len(costs) + 1), costs, color="black", lw=1.2)
+    ax.set_xlim(0.5, len(costs) + 0.5)
+    ax.set_ylim(0.0, None)
+    ax.set_xlabel("contact change")
+    ax.set_ylabel("cost-to-go [m]")
+    finish_axes(ax)
+    return save_plot(fig, path)
+
+
 def stability_over_time(
     world: World, rollout: Rollout, rows: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -887,6 +910,8 @@ def render_run(
     if rollout is not None:
         files.append(contact_plot(plan, rollout, folder / "contacts.png"))
         files.append(stability_plot(plan, rollout, folder / "stability.png"))
+    if plan.iterations:
+        files.append(cost_to_go_plot(plan, folder / "cost-to-go.png"))
     tell("pictures", 0.4, "keyframes")
     files.append(keyframe_sheet(plan, folder / "keyframes.png"))
     if rollout is not None:

@@ -1,0 +1,923 @@
+"""General policy + scene -> plan: climb up, crawl, turn, climb down, step to the goal.
+
+Algorithm 3 of the thesis: the policy's cycles are run from the initial state until the
+goal; contacts start at the obstacle's closest points and go on by a third of what the
+limb reaches, towards the goal; each of them is planned by the ordinary search. What
+comes next is read off the stance alone, so that a plan can go on from any stance, as it
+is felt.
+
+The way down is a way up: a climb that is statically stable is so backwards as well. The
+ascent is planned from where the robot will stand behind the far edge; each of its
+moves, reversed, is where a move of the descent is looked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clamber.contact import Contact, ContactSequence, Stance
+from clamber.errors import InputError
+from clamber.model import Robot, World, build_world
+from clamber.moves import Guide, Move, Skipped, Step
+from clamber.path import Path
+from clamber.pipeline import (
+    Iteration,
+    Plan,
+    PlanOptions,
+    Progress,
+    check_start,
+    search_steps,
+    timed,
+)
+from clamber.policy import (
+    Edge,
+    GeneralPolicy,
+    Option,
+    pelvis_angles,
+    pelvis_distribution,
+    pelvis_rotation,
+)
+from clamber.posture.ik import IK, PostureProblem
+from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
+from clamber.route import Place, Platform, find_place, find_platforms, goal_of
+from clamber.scene import GROUND, Scene
+from clamber.se3 import matrix_from_quat, quat_from_matrix
+from clamber.search import home_at, plan_step, standing
+
+STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
+TURN = 0.25  # [rad] of the body in one cycle on all fours
+STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
+SHRUNK = (1.0, 0.6, 0.3)  # a step that fails is tried shorter
+SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
+ARRIVED = 0.05  # [m] from where it shall get to, the body is there
+NEARLY = 0.12  # [m] ... where it gets no nearer, it may climb down from here
+FACING = 0.15  # [rad] from how it shall face
+# Where the body stands before an edge, in lengths of its legs, and what may differ.
+STAND, STAND_TOL = 0.54, 0.12
+BESIDE_TOL = 0.10  # [m] along the edge
+REACH = 0.65  # lengths of an arm that hands reach beyond a stand
+# Contacts while climbing, from the edge inwards: in steps of the limb.
+DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
+LEAN = np.radians(80.0)  # of the trunk on all fours
+CLEAR = 0.02  # [m] between a surface and what is higher than its support
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Followed:
+    """What following a policy gave.
+
+    Attributes:
+        keyframes: The first one, and one more for each path.
+        paths: Between neighbouring keyframes.
+        iterations: One for each path.
+        missed: Why it did not get to the goal; empty where it did, or was cut short.
+        arrived: It is at the goal.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    paths: tuple[Path, ...]
+    iterations: tuple[Iteration, ...]
+    missed: str
+    arrived: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Frame:
+    """Where the body is over its contacts: x, y [m] and yaw [rad]."""
+
+    xy: np.ndarray
+    yaw: float
+
+    def at(self, offset: np.ndarray) -> np.ndarray:
+        return self.xy + _turn(self.yaw) @ offset
+
+    def local(self, p: np.ndarray) -> np.ndarray:
+        return _turn(self.yaw).T @ (p[:2] - self.xy)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Build:
+    """What a robot's build says of its steps.
+
+    Attributes:
+        step: Of each limb (5.9) [m].
+        fours: (2,) offset of each limb's contact from the body's frame, on all fours.
+        feet: Half the distance between the feet.
+        stand: From the feet to an edge that is to be climbed [m].
+        reach: From the feet to an edge, at most [m].
+        tall: Height that hands reach, standing [m].
+        thigh: [m]
+    """
+
+    step: dict[str, float]
+    fours: dict[str, np.ndarray]
+    feet: float
+    stand: float
+    reach: float
+    tall: float
+    thigh: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Task:
+    """All that does not change on the way."""
+
+    ik: IK
+    policy: GeneralPolicy
+    options: PlanOptions
+    platforms: tuple[Platform, ...]
+    goal: np.ndarray
+    goal_yaw: float | None
+    build: _Build
+    fours: np.ndarray
+
+
+_Made = tuple[Keyframe, Path, str]
+
+
+def plan_traverse(
+    policy: GeneralPolicy,
+    robot: Robot,
+    scene: Scene,
+    *,
+    options: PlanOptions | None = None,
+    progress: Progress | None = None,
+) -> Plan:
+    """Plan the way to the scene's goal with a general policy.
+
+    Raises:
+        InputError: The scene is out of the robot's reach, its goal cannot be, or the
+            policy does not say how to climb.
+    """
+    options = options or PlanOptions()
+    report = progress or (lambda stage, share, note: None)
+    world = build_world(robot, scene)
+    ik = IK(world)
+    task = _task(ik, policy, options)
+    start = standing(ik, options.keyframe)
+    check_start(ik, start)
+    _check_route(task)
+    found = _follow(task, start, options.max_changes, report)
+    report("trajectory", 1.0, "")
+    trajectory = timed(world, found.paths, options.speed)
+    stances = tuple(Stance(contacts=k.stance) for k in found.keyframes)
+    skipped = ()
+    if found.missed:
+        skipped = (Skipped(stance=len(stances), reason=found.missed, missed=True),)
+    return Plan(
+        world=world,
+        options=options,
+        sequence=ContactSequence(
+            source="; ".join(policy.sources) or "a policy",
+            subject=None,
+            scene=scene,
+            stances=stances,
+            t=np.arange(len(stances) + 1.0),
+        ),
+        keyframes=found.keyframes,
+        paths=found.paths,
+        skipped=skipped,
+        trajectory=trajectory,
+        complete=found.arrived and bool(found.paths),
+        timings={},
+        policy=policy,
+        iterations=found.iterations,
+    )
+
+
+def follow_policy(
+    ik: IK, policy: GeneralPolicy, key: Keyframe, options: PlanOptions, changes: int
+) -> Followed:
+    """Go on with a policy from a keyframe.
+
+    Args:
+        ik: Workspace.
+        policy: The policy.
+        key: Where to go on from.
+        options: Of the plan.
+        changes: Contact changes at most, then to the end of what was begun.
+    """
+    task = _task(ik, policy, options)
+    return _follow(task, key, changes, lambda stage, share, note: None)
+
+
+def _follow(task: _Task, key: Keyframe, changes: int, report: Progress) -> Followed:
+    keyframes, paths, iterations = [key], [], []
+    first = cost_to_go(key.stance, task.goal)
+    missed, arrived = "", False
+    while len(paths) < changes:
+        to_go = cost_to_go(keyframes[-1].stance, task.goal)
+        share = 1.0 - min(to_go / max(first, 1e-9), 1.0)
+        report("plan", share, f"{to_go:.2f} m to go, {len(paths)} contact changes")
+        made, missed = _manoeuvre(task, keyframes[-1])
+        for after, path, option in made:
+            keyframes.append(after)
+            paths.append(path)
+            iterations.append(
+                Iteration(option=option, cost=cost_to_go(after.stance, task.goal))
+            )
+        if not made:
+            arrived = not missed
+            break
+        missed = ""
+    else:
+        if len(paths) >= task.options.max_changes:
+            missed = f"{task.options.max_changes} contact changes were not enough"
+    return Followed(
+        keyframes=tuple(keyframes),
+        paths=tuple(paths),
+        iterations=tuple(iterations),
+        missed=missed,
+        arrived=arrived,
+    )
+
+
+def cost_to_go(stance: Sequence[Contact], goal: np.ndarray) -> float:
+    """From the mean of all contacts to the goal (2,) [m] [algorithm 3, step 11]."""
+    middle = np.mean([c.position[:2] for c in stance], axis=0)
+    return float(np.linalg.norm(goal - middle))
+
+
+# What comes next.
+
+
+def _manoeuvre(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
+    """The next contacts, and why there are no more; neither where it has arrived."""
+    platform = _platform_of(task, key.stance)
+    if platform is None:
+        return _on_feet(task, key)
+    grounded = [c for c in key.stance if c.support == GROUND]
+    if grounded:
+        feet = np.mean([c.position for c in grounded], axis=0)
+        if platform.exit is not None and platform.exit.distance(feet) < 0:
+            return _climb_down(task, key, platform)
+        return _climb_up(task, key, platform.entry, platform)
+    return _on_fours(task, key, platform)
+
+
+def _platform_of(task: _Task, stance: Sequence[Contact]) -> Platform | None:
+    for platform in task.platforms:
+        if any(c.support in platform.boxes for c in stance):
+            return platform
+    return None
+
+
+# On its feet.
+
+
+def _on_feet(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
+    frame = _feet_frame(task, key.stance)
+    ahead = next((p for p in task.platforms if not _passed(p, frame.xy)), None)
+    if ahead is not None:
+        wanted = _before(task, ahead.entry)
+        local = wanted.local(frame.xy)
+        near = (
+            abs(local[0]) <= STAND_TOL * task.build.stand / STAND
+            and abs(local[1]) <= BESIDE_TOL
+            and abs(_apart(frame.yaw, wanted.yaw)) <= FACING
+        )
+        if near:
+            return _climb_up(task, key, ahead.entry, ahead)
+        return _walk(task, key, frame, wanted)
+    wanted = _Frame(task.goal, frame.yaw if task.goal_yaw is None else task.goal_yaw)
+    if _there(frame, wanted):
+        return [], ""
+    return _walk(task, key, frame, wanted)
+
+
+def _passed(platform: Platform, xy: np.ndarray) -> bool:
+    return (
+        platform.exit is not None
+        and platform.exit.distance(xy) < 0
+        and (platform.entry.distance(xy) > 0)
+    )
+
+
+def _before(task: _Task, edge: Edge) -> _Frame:
+    """Where the feet stand before an edge."""
+    return _Frame(edge.point - task.build.stand * edge.inward, edge.yaw)
+
+
+def _there(frame: _Frame, wanted: _Frame) -> bool:
+    away = float(np.linalg.norm(frame.xy - wanted.xy))
+    return away <= ARRIVED and abs(_apart(frame.yaw, wanted.yaw)) <= FACING
+
+
+def _feet_frame(task: _Task, stance: Sequence[Contact]) -> _Frame:
+    """Midpoint of the feet, and the mean of how they are turned."""
+    feet = [c for c in stance if _is_foot(task, c)]
+    ways = np.sum([matrix_from_quat(c.quaternion)[:2, 0] for c in feet], axis=0)
+    middle = np.mean([c.position[:2] for c in feet], axis=0)
+    return _Frame(middle, float(np.arctan2(ways[1], ways[0])))
+
+
+def _is_foot(task: _Task, c: Contact) -> bool:
+    limb = task.ik.world.robot.limb_of(c.surface)
+    return not limb.is_arm and c.surface == limb.surfaces[0]
+
+
+def _walk(
+    task: _Task, key: Keyframe, frame: _Frame, wanted: _Frame
+) -> tuple[list[_Made], str]:
+    """One step of each foot towards where it shall stand."""
+    legs = [x for x in task.ik.world.robot.limbs.values() if not x.is_arm]
+    step = min(task.build.step[x.name] for x in legs)
+    body = _between(frame, wanted, step, STEP_TURN)
+    side = _turn(frame.yaw).T @ (body.xy - frame.xy)
+    turn = _apart(frame.yaw, body.yaw)
+    left_first = side[1] + task.build.feet * turn > 0
+    legs.sort(key=lambda x: x.name.startswith("left") != left_first)
+    made: list[_Made] = []
+    why = ""
+    for leg in legs:
+        sign = 1.0 if leg.name.startswith("left") else -1.0
+        target = body.at(np.array([0.0, sign * task.build.feet]))
+        now = next(c for c in key.stance if c.surface in leg.surfaces)
+        place = Place(support=now.support, position=np.array([*target, 0.0]))
+        found = _attempt(
+            task, key, leg.surfaces[0], now, place, body, _home(task, body)
+        )
+        if isinstance(found, str):
+            why = found
+            continue
+        key, path = found
+        made.append((key, path, task.policy.options[-1].name))
+    return made, why
+
+
+def _home(task: _Task, body: _Frame) -> np.ndarray:
+    """(nq,) the posture that the robot starts from, over the feet."""
+    ahead = _home_ahead(task)
+    return home_at(task.ik.world, np.array([*body.at(-ahead), body.yaw]))
+
+
+# Up and down.
+
+
+def _climb_up(
+    task: _Task, key: Keyframe, edge: Edge, platform: Platform
+) -> tuple[list[_Made], str]:
+    """All that is left of a climb."""
+    rows = _ascent(task, edge, platform)
+    steps, names = _left_of(task, key, rows)
+    if not steps:
+        return [], "nothing is left to climb with"
+    found, _ = search_steps(task.ik, steps, task.options, start=key)
+    made = list(zip(found.keyframes[1:], found.paths, names, strict=False))
+    if found.missed:
+        return [], found.missed[0].reason
+    return made, ""
+
+
+def _ascent(task: _Task, edge: Edge, platform: Platform) -> list[tuple[Step, str]]:
+    """The steps of a climb with the cycles that they belong to."""
+    world, policy = task.ik.world, task.policy
+    yaw = edge.yaw
+    rows: list[tuple[Step, str]] = []
+    at: dict[str, str] = {}
+    for option in policy.options:
+        for surface in option.surfaces:
+            limb = world.robot.limb_of(surface)
+            if at.get(limb.name) == surface:
+                continue
+            if option.region == "O" and limb.is_arm and limb.name in at:
+                continue
+            offset = _climb_offset(task, surface)
+            place = _place(task, platform, surface, _Frame(edge.point, yaw).at(offset))
+            contact = _contact(world, surface, place, yaw)
+            breaks = (at[limb.name],) if limb.name in at else ()
+            if not limb.is_arm and not breaks:
+                breaks = (limb.surfaces[0],)
+            at[limb.name] = surface
+            move = Move(limb=limb.name, breaks=breaks, makes=contact)
+            step = Step(stance=0, target=Stance(contacts=()), move=move)
+            rows.append((step, option.name))
+        if option.region == "O":
+            break
+    return rows
+
+
+def _climb_offset(task: _Task, surface: str) -> np.ndarray:
+    """(2,) from the edge inwards and to the left."""
+    limb = task.ik.world.robot.limb_of(surface)
+    outer = surface == limb.surfaces[0]
+    fours = task.build.fours[limb.name]
+    if not limb.is_arm:
+        return np.array([DEPTH["knee"] * task.build.step[limb.name], 0.9 * fours[1]])
+    kind = "hand" if outer else "elbow"
+    side = 0.36 * fours[1] if outer else fours[1]
+    return np.array([DEPTH[kind] * task.build.step[limb.name], side])
+
+
+def _left_of(
+    task: _Task, key: Keyframe, rows: Sequence[tuple[Step, str]]
+) -> tuple[list[Step], list[str]]:
+    """The rows that come after the surfaces that each limb is on."""
+    robot = task.ik.world.robot
+    now = {robot.limb_of(c.surface).name: c.surface for c in key.stance}
+    done = []
+    for limb, surface in now.items():
+        for i, (step, _) in enumerate(rows):
+            makes = step.move.makes
+            if step.move.limb == limb and makes and makes.surface == surface:
+                done += [j for j in range(i + 1) if rows[j][0].move.limb == limb]
+    left = [i for i in range(len(rows)) if i not in done]
+    return [rows[i][0] for i in left], [rows[i][1] for i in left]
+
+
+def _descent(task: _Task, platform: Platform) -> list[tuple[Step, str]] | str:
+    """The ascent from behind the far edge with its steps reversed, or why not."""
+    edge = platform.exit
+    assert edge is not None
+    world = task.ik.world
+    frame = _before(task, edge)
+    ahead = _home_ahead(task)
+    at = np.array([*frame.at(-ahead), frame.yaw])
+    start = standing(task.ik, task.options.keyframe, at)
+    rows = _ascent(task, edge, platform)
+    steps = [s for s, _ in rows]
+    found, _ = search_steps(task.ik, steps, task.options, start=start)
+    if found.missed:
+        return found.missed[0].reason
+    home = home_at(world, at)
+    out = []
+    for path, (_, name) in zip(found.paths[::-1], rows[::-1], strict=True):
+        t = path.transition
+        made = t.move.makes
+        assert made is not None
+        before = t.leaving[0] if t.leaving else None
+        move = Move(limb=t.move.limb, breaks=(made.surface,), makes=before, firm=True)
+        guide = Guide(shifted=t.touching, touching=t.shifted)
+        reference = home if before is None else None
+        out.append(
+            (
+                Step(
+                    stance=0,
+                    target=Stance(contacts=()),
+                    move=move,
+                    guide=guide,
+                    reference=reference,
+                ),
+                name,
+            )
+        )
+    return out
+
+
+def _home_ahead(task: _Task) -> np.ndarray:
+    """(2,) from the ankles' midpoint to the feet's, in the body's frame."""
+    world, kin = task.ik.world, task.ik.kin
+    kin.update(world.home)
+    legs = [x.surfaces[0] for x in world.robot.limbs.values() if not x.is_arm]
+    up = np.array([0.0, 0.0, 1.0])
+    feet = np.mean([kin.contact_point(s, up)[:2] for s in legs], axis=0)
+    return _turn(world.scene.start[2]).T @ (feet - world.scene.start[:2])
+
+
+def _climb_down(
+    task: _Task, key: Keyframe, platform: Platform
+) -> tuple[list[_Made], str]:
+    """All that is left of a descent."""
+    there = _descent(task, platform)
+    if isinstance(there, str):
+        return [], there
+    robot = task.ik.world.robot
+    now = {robot.limb_of(c.surface).name: c.surface for c in key.stance}
+    steps, names = [], []
+    for step, name in there:
+        limb = step.move.limb
+        if now.get(limb) not in step.move.breaks:
+            continue
+        if step.move.makes is None:
+            del now[limb]
+        else:
+            now[limb] = step.move.makes.surface
+        steps.append(step)
+        names.append(name)
+    if not steps:
+        return [], "nothing is left to climb down with"
+    found, _ = search_steps(task.ik, steps, task.options, start=key)
+    if found.missed:
+        return [], found.missed[0].reason
+    return list(zip(found.keyframes[1:], found.paths, names, strict=True)), ""
+
+
+# On all fours.
+
+
+def _on_fours(
+    task: _Task, key: Keyframe, platform: Platform
+) -> tuple[list[_Made], str]:
+    """One cycle on top, or the descent where it begins."""
+    frame = _fours_frame(task, key.stance)
+    if platform.exit is None:
+        yaw = frame.yaw if task.goal_yaw is None else task.goal_yaw
+        wanted = _Frame(task.goal, yaw)
+        if _there(frame, wanted):
+            return [], ""
+        return _crawl(task, key, platform, frame, wanted)
+    wanted = _behind(task, platform.exit)
+    if _there(frame, wanted):
+        return _climb_down(task, key, platform)
+    made, why = _crawl(task, key, platform, frame, wanted)
+    if not made and np.linalg.norm(frame.xy - wanted.xy) <= NEARLY:
+        return _climb_down(task, key, platform)
+    return made, why
+
+
+def _behind(task: _Task, edge: Edge) -> _Frame:
+    """Where the body is on all fours before it climbs down: facing inwards."""
+    knee = max(-o[0] for o in task.build.fours.values())
+    depth = knee + DEPTH["knee"] * min(task.build.step.values())
+    return _Frame(edge.point + 0.8 * depth * edge.inward, edge.yaw)
+
+
+def _by_limb(task: _Task, stance: Sequence[Contact]) -> dict[str, Contact]:
+    return {task.ik.world.robot.limb_of(c.surface).name: c for c in stance}
+
+
+def _fours_frame(task: _Task, stance: Sequence[Contact]) -> _Frame:
+    """The middle of the contacts; the yaw that fits them best to `fours`."""
+    on = {n: c.position[:2] for n, c in _by_limb(task, stance).items()}
+    middle = np.mean(list(on.values()), axis=0)
+    offsets = {n: task.build.fours[n] for n in on}
+    centre = np.mean(list(offsets.values()), axis=0)
+    dot = cross = 0.0
+    for n, p in on.items():
+        a, b = offsets[n] - centre, p - middle
+        dot += float(a @ b)
+        cross += float(a[0] * b[1] - a[1] * b[0])
+    return _Frame(middle, float(np.arctan2(cross, dot)))
+
+
+def _crawl_step(task: _Task) -> float:
+    return min(task.build.step.values())
+
+
+def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
+    """One cycle from `a` towards `b`: the way first, the turn as late as it can be."""
+    way, angle = b.xy - a.xy, _apart(a.yaw, b.yaw)
+    away = float(np.linalg.norm(way)) / step
+    turns = abs(angle) / turn
+    cycles = max(away, turns, 1.0)
+    share = angle / cycles if away <= turns + 1.0 or turns == 0 else 0.0
+    return _Frame(a.xy + way / cycles, a.yaw + share)
+
+
+def _crawl(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    frame: _Frame,
+    wanted: _Frame,
+) -> tuple[list[_Made], str]:
+    """One cycle towards `wanted`."""
+    option = next(o for o in task.policy.options if o.region == "O")
+    step = _crawl_step(task)
+    full = _between(frame, wanted, step, TURN)
+    tries = (
+        full,
+        _Frame(0.5 * (frame.xy + full.xy), frame.yaw + 0.5 * (full.yaw - frame.yaw)),
+        _Frame(full.xy, frame.yaw),
+        _Frame(frame.xy, full.yaw),
+    )
+    why = ""
+    for body in tries:
+        made: list[_Made] = []
+        left = list(_leading_first(task, option, frame, full))
+        # What cannot move yet is tried again once the others have, and then shorter.
+        left, why = _cycle(task, key, platform, option, body, left, made, first=True)
+        if left:
+            now = made[-1][0] if made else key
+            left, why = _cycle(task, now, platform, option, body, left, made)
+        if left and made:
+            # The others have gone too far ahead: around the first that is left behind
+            # they stand again as they should, and it may follow.
+            stuck, now = left[0], made[-1][0]
+            limb = task.ik.world.robot.limb_of(stuck).name
+            here = _by_limb(task, now.stance)[limb].position[:2]
+            back = here - _turn(body.yaw) @ task.build.fours[limb]
+            others = [s for s in option.surfaces if s != stuck]
+            around = _Frame(back, body.yaw)
+            _cycle(task, now, platform, option, around, others, made)
+            left, why = _cycle(task, made[-1][0], platform, option, body, [stuck], made)
+            if left:
+                return [], why
+        if made:
+            return made, ""
+    return [], why or "no contact of the cycle moves"
+
+
+def _cycle(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    body: _Frame,
+    surfaces: Sequence[str],
+    made: list[_Made],
+    *,
+    first: bool = False,
+) -> tuple[list[str], str]:
+    """Move some contacts of a cycle; those that cannot be, and why the last of them.
+
+    Args:
+        task: What does not change.
+        key: Where to go on from.
+        platform: On which.
+        option: The cycle.
+        body: Where the body shall get to.
+        surfaces: To move, in order.
+        made: Receives what was found.
+        first: All the way or not at all, the pelvis as the policy has it.
+    """
+    left, why = [], ""
+    for surface in surfaces:
+        limb = task.ik.world.robot.limb_of(surface).name
+        here = _by_limb(task, key.stance)[limb]
+        place = _place(task, platform, surface, body.at(task.build.fours[limb]))
+        if np.linalg.norm(place.position - here.position) < SAME:
+            continue
+        found = _attempt(
+            task,
+            key,
+            surface,
+            here,
+            place,
+            body,
+            task.fours,
+            shares=SHRUNK[:1] if first else SHRUNK,
+            imposed=first,
+        )
+        if isinstance(found, str):
+            left.append(surface)
+            why = found
+            continue
+        key, path = found
+        made.append((key, path, option.name))
+    return left, why
+
+
+def _leading_first(
+    task: _Task, option: Option, frame: _Frame, full: _Frame
+) -> tuple[str, ...]:
+    """The cycle, begun with the limbs that are ahead on the way: arms, or legs.
+
+    Where elbows follow knees and step first, what bears the robot shrinks.
+    """
+    way = _turn(frame.yaw).T @ (full.xy - frame.xy)
+    arms_lead = way[0] > -1e-6
+    robot = task.ik.world.robot
+    leads = [robot.limb_of(s).is_arm == arms_lead for s in option.surfaces]
+    k = leads.index(True) if True in leads else 0
+    return option.surfaces[k:] + option.surfaces[:k]
+
+
+# One contact.
+
+
+def _attempt(
+    task: _Task,
+    key: Keyframe,
+    surface: str,
+    here: Contact,
+    place: Place,
+    body: _Frame,
+    reference: np.ndarray | None,
+    *,
+    shares: Sequence[float] = SHRUNK,
+    imposed: bool = True,
+) -> tuple[Keyframe, Path] | str:
+    """Move one contact to a place, or part of the way there; or why not."""
+    world = task.ik.world
+    limb = world.robot.limb_of(surface)
+    why = ""
+    for share in shares:
+        position = place.position
+        if share < 1.0:
+            if here.support != place.support:
+                break
+            position = here.position + share * (place.position - here.position)
+        contact = _contact(
+            world, surface, Place(support=place.support, position=position), body.yaw
+        )
+        move = Move(limb=limb.name, breaks=(here.surface,), makes=contact, firm=True)
+        step = Step(
+            stance=0,
+            target=Stance(contacts=()),
+            move=move,
+            base_rotation=_pelvis(task, key, body) if imposed else None,
+            reference=reference,
+        )
+        found = plan_step(
+            task.ik,
+            key,
+            step,
+            task.options.method,
+            task.options.keyframe,
+            lambda stage: None,
+        )
+        if not isinstance(found, str):
+            return found
+        why = found
+    return why
+
+
+def _pelvis(task: _Task, key: Keyframe, body: _Frame) -> np.ndarray | None:
+    """(3, 3) how the pelvis should be held [algorithm 3, step 14]; None on the ground.
+
+    As it is, turned the way that the body faces, its roll within what the policy
+    imposes. Pitch is left to the robot: a person, whose thighs are longer than the
+    upper arms, crawls with the hips high, and a robot of another build that is held so
+    has its weight on its elbows and cannot lift them.
+    """
+    platform = _platform_of(task, key.stance)
+    if platform is None:
+        return None
+    kin = task.ik.kin
+    kin.update(key.q)
+    R = kin.rotation(task.ik.world.base)
+    position = np.array([*body.xy, key.q[2]])
+    held = pelvis_distribution(
+        task.policy, platform.edges, position, near=task.build.thigh
+    )
+    angles = pelvis_angles(R)
+    if held is not None:
+        angles[0] = held.clip(angles)[0]
+    return pelvis_rotation(np.array([angles[0], angles[1], body.yaw]))
+
+
+def _contact(world: World, surface: str, place: Place, yaw: float) -> Contact:
+    R = np.eye(3)
+    R[:2, :2] = _turn(yaw)
+    return Contact(
+        surface=surface,
+        support=place.support,
+        position=world.supports[place.support].project(place.position),
+        quaternion=quat_from_matrix(R),
+    )
+
+
+def _place(task: _Task, platform: Platform, surface: str, wanted: np.ndarray) -> Place:
+    """Where on the platform a surface can rest, nearest to `wanted` (2,)."""
+    world = task.ik.world
+    beside = world.surfaces[surface].radius + CLEAR
+    place = find_place(world.scene, platform.boxes, wanted, beside)
+    if place is not None:
+        return place
+    top = world.supports[platform.boxes[0]]
+    return Place(support=top.name, position=top.project(np.array([*wanted, 0.0])))
+
+
+def _apart(a: float, b: float) -> float:
+    """From one yaw to another, the short way [rad]."""
+    return math.remainder(b - a, 2.0 * math.pi)
+
+
+def _turn(yaw: float) -> np.ndarray:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s], [s, c]])
+
+
+# The robot's build, and what cannot be.
+
+
+def _task(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> _Task:
+    scene = ik.world.scene
+    goal = goal_of(scene)
+    yaw = scene.goal
+    build = _build(ik, policy)
+    return _Task(
+        ik=ik,
+        policy=policy,
+        options=options,
+        platforms=find_platforms(scene, goal),
+        goal=goal,
+        goal_yaw=float(yaw[2]) if yaw is not None and len(yaw) == 3 else None,
+        build=build,
+        fours=_posture_on_fours(ik, policy, build),
+    )
+
+
+def _posture_on_fours(ik: IK, policy: GeneralPolicy, build: _Build) -> np.ndarray:
+    """(nq,) the robot on elbows and knees, held as the policy holds its pelvis.
+
+    What steps on all fours stay near to, so that twists do not add up.
+    """
+    world = ik.world
+    option = next((o for o in policy.options if o.region == "O"), None)
+    if option is None:
+        return world.home
+    frame = _Frame(world.scene.start[:2], float(world.scene.start[2]))
+    up = {}
+    for surface in option.surfaces:
+        xy = frame.at(build.fours[world.robot.limb_of(surface).name])
+        place = Place(support=GROUND, position=np.array([*xy, 0.0]))
+        up[surface] = _contact(world, surface, place, frame.yaw)
+    held = pelvis_rotation(np.array([0.0, LEAN, frame.yaw]))
+    q = world.home.copy()
+    q[3:7] = quat_from_matrix(held)
+    q[2] *= 0.7
+    problem = PostureProblem(
+        goals=tuple(held_goal(world, c) for c in up.values()),
+        q_reference=world.home,
+        clearance=_own_clearance(world),
+        base_rotation=held,
+    )
+    return ik.solve_hard(problem, q).q
+
+
+def _own_clearance(world: World) -> np.ndarray:
+    """(P,) the robot keeps off itself; the scene does not count."""
+    own = (world.model.geom_bodyid[world.pairs] > 0).all(axis=1)
+    return np.where(own, CLEARANCE, -np.inf)
+
+
+def _build(ik: IK, policy: GeneralPolicy) -> _Build:
+    world, kin = ik.world, ik.kin
+    kin.update(world.home)
+    along = _turn(world.scene.start[2])
+    limbs = world.robot.limbs.values()
+    root = {x.name: along.T @ kin.landmark(x.root)[1][:2] for x in limbs}
+    arms = [x for x in limbs if x.is_arm]
+    legs = [x for x in limbs if not x.is_arm]
+    length = {
+        x.name: sum(
+            float(np.linalg.norm(kin.landmark(a)[1] - kin.landmark(b)[1]))
+            for a, b in ((x.root, x.middle), (x.middle, x.end))
+        )
+        for x in limbs
+    }
+    trunk = float(
+        np.linalg.norm(kin.landmark(arms[0].root)[1] - kin.landmark(legs[0].root)[1])
+    )
+    step = {}
+    for x in limbs:
+        shown = [policy.reach[s] for s in x.surfaces if s in policy.reach]
+        step[x.name] = min(1.0 / STEPS, max(shown, default=1.0)) * length[x.name]
+    half = {
+        kind: 0.5 * abs(float(root[a.name][1] - root[b.name][1]))
+        for kind, (a, b) in (("arm", arms), ("leg", legs))
+    }
+    fours = {}
+    for x in limbs:
+        sign = 1.0 if x.name.startswith("left") else -1.0
+        side = 1.1 * half["arm"] if x.is_arm else 1.35 * half["leg"]
+        ahead = 0.35 * trunk if x.is_arm else -0.35 * trunk
+        fours[x.name] = np.array([ahead, sign * side])
+    up = np.array([0.0, 0.0, 1.0])
+    soles = [kin.contact_point(x.surfaces[0], up)[:2] for x in legs]
+    leg, arm = length[legs[0].name], length[arms[0].name]
+    thigh = float(
+        np.linalg.norm(kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1])
+    )
+    return _Build(
+        step=step,
+        fours=fours,
+        feet=0.5 * float(np.linalg.norm(soles[0] - soles[1])),
+        stand=STAND * leg,
+        reach=STAND * leg + REACH * arm,
+        tall=leg + trunk + arm,
+        thigh=thigh,
+    )
+
+
+def _check_route(task: _Task) -> None:
+    """A scene that cannot be crossed from where the robot stands.
+
+    Raises:
+        InputError: The policy has no cycle on top, or the first obstacle is too far.
+    """
+    world = task.ik.world
+    regions = [o.region for o in task.policy.options]
+    if task.platforms and "O" not in regions:
+        raise InputError(
+            "a policy with a cycle on the obstacle (region O)",
+            field="policy.options",
+            value=regions,
+        )
+    for name in (b for p in task.platforms for b in p.boxes):
+        top = float(world.supports[name].position[2])
+        if top > task.build.tall:
+            raise InputError(
+                f"a top within {task.build.tall:.2f} m, what the robot reaches, between"
+                " start and goal",
+                field=f"scene.boxes.{name}",
+                value=f"{top:.2f} m high",
+            )
+    if not task.platforms:
+        return
+    first = task.platforms[0].entry
+    away = -first.distance(np.array([*world.scene.start[:2], 0.0]))
+    if away > task.build.reach:
+        walk = away - task.build.stand
+        raise InputError(
+            f"an obstacle within {task.build.reach:.2f} m, the robot's reach: it must"
+            f" first walk {walk:.2f} m",
+            field=f"scene.boxes.{task.platforms[0].boxes[0]}",
+            value=f"{away:.2f} m away",
+        )

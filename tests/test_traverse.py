@@ -1,0 +1,245 @@
+"""Planning with a general policy, from its parts to a whole crossing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clamber import traverse as module
+from clamber.contact import Contact
+from clamber.errors import InputError
+from clamber.io import load_plan, save_plan
+from clamber.model import Kinematics, build_world, load_robot
+from clamber.pipeline import Plan, PlanOptions
+from clamber.policy import GeneralPolicy, Option, PelvisDistribution
+from clamber.posture.ik import IK
+from clamber.posture.keyframe import contact_drift
+from clamber.scene import GROUND, Box, Scene
+from clamber.traverse import cost_to_go, follow_policy, plan_traverse
+
+
+def option(name: str, region, surfaces, until) -> Option:
+    return Option(
+        name=name,
+        region=region,
+        surfaces=surfaces,
+        repeats=2,
+        initiation=("M",),
+        held=(),
+        termination=until,
+    )
+
+
+HANDS, ELBOWS = ("LHand", "RHand"), ("LElbow", "RElbow")
+POLICY = GeneralPolicy(
+    options=(
+        option("ac1", "M", HANDS, "M"),
+        option("ac2", "M", ELBOWS, "O"),
+        option("ac3", "O", (*ELBOWS, "LKnee", "RKnee"), "M"),
+        option("ac2", "M", ELBOWS, "M"),
+        option("ac1", "M", HANDS, "goal"),
+        option("ac4", "goal", ("LFoot", "RFoot"), "goal"),
+    ),
+    over_top=PelvisDistribution(
+        mean=np.array([0.0, 1.4, 1.2]), sigma=np.array([0.1, 0.2, 1.3]), samples=9
+    ),
+    near_edge=PelvisDistribution(
+        mean=np.array([0.0, 1.0, 0.0]), sigma=np.array([0.1, 0.4, 0.2]), samples=9
+    ),
+    goal=("LFoot", "RFoot"),
+)
+
+
+def scene(length=0.6, width=0.8, height=0.25, face=0.23, goal=None) -> Scene:
+    box = Box(
+        name="table",
+        size=np.array([length, width, height]),
+        position=np.array([face + length / 2, 0.0, height / 2]),
+        rotation=np.eye(3),
+    )
+    goal = [face + length + 0.25, 0.0] if goal is None else goal
+    return Scene(boxes=(box,), start=np.zeros(3), goal=np.array(goal))
+
+
+def contact(surface: str, x: float, y: float, support="table") -> Contact:
+    return Contact(
+        surface=surface,
+        support=support,
+        position=np.array([x, y, 0.0]),
+        quaternion=np.array([1.0, 0, 0, 0]),
+    )
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("coman")
+
+
+@pytest.fixture(scope="module")
+def task(robot):
+    ik = IK(build_world(robot, scene()))
+    return module._task(ik, POLICY, PlanOptions())
+
+
+@pytest.fixture(scope="module")
+def crossing(robot) -> Plan:
+    return plan_traverse(POLICY, robot, scene())
+
+
+def test_cost_to_go_is_the_distance_of_the_contacts_mean():
+    stance = (contact("LKnee", 0.0, 1.0), contact("RKnee", 2.0, 1.0))
+    assert cost_to_go(stance, np.array([1.0, 4.0])) == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("yaw", [-3.0, -1.0, 0.4, 2.5])
+def test_the_frame_on_all_fours_is_found_again_from_its_contacts(task, yaw):
+    frame = module._Frame(np.array([0.4, -0.2]), yaw)
+    surfaces = {
+        "left_arm": "LElbow",
+        "right_arm": "RElbow",
+        "left_leg": "LKnee",
+        "right_leg": "RKnee",
+    }
+    stance = [
+        contact(surfaces[n], *frame.at(offset))
+        for n, offset in task.build.fours.items()
+    ]
+    found = module._fours_frame(task, stance)
+    np.testing.assert_allclose(found.xy, frame.xy, atol=1e-12)
+    assert math.remainder(found.yaw - yaw, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+
+
+def test_a_cycle_goes_no_farther_and_turns_no_more_than_it_may():
+    a = module._Frame(np.zeros(2), 3.0)
+    b = module._Frame(np.array([1.0, 0.0]), -3.0)
+    c = module._between(a, b, 0.1, 0.25)
+    np.testing.assert_allclose(c.xy, [0.1, 0.0])
+    assert c.yaw == 3.0  # there is time to turn
+    turning = module._between(a, module._Frame(np.zeros(2), -2.0), 0.1, 0.25)
+    assert turning.yaw == pytest.approx(3.25)  # the short way round
+    last = module._between(a, module._Frame(np.array([0.05, 0.0]), 3.1), 0.1, 0.25)
+    np.testing.assert_allclose([*last.xy, last.yaw], [0.05, 0.0, 3.1])
+
+
+def test_legs_lead_backwards_and_arms_forwards(task):
+    cycle = POLICY.options[2]
+    here = module._Frame(np.zeros(2), math.pi)
+    back = module._Frame(np.array([0.1, 0.0]), math.pi)  # facing the other way
+    ahead = module._Frame(np.array([-0.1, 0.0]), math.pi)
+    lead = module._leading_first
+    assert lead(task, cycle, here, back) == ("LKnee", "RKnee", "LElbow", "RElbow")
+    assert lead(task, cycle, here, ahead) == cycle.surfaces
+
+
+def test_the_posture_on_all_fours_rests_on_them_level(task):
+    world = task.ik.world
+    kin = Kinematics(world)
+    kin.update(task.fours)
+    up = np.array([0.0, 0.0, 1.0])
+    points = [kin.contact_point(s, up) for s in POLICY.options[2].surfaces]
+    np.testing.assert_allclose([p[2] for p in points], 0.0, atol=1e-3)
+
+
+def test_steps_are_a_third_of_a_limb_or_what_was_shown(robot):
+    ik = IK(build_world(robot, scene()))
+    far = module._build(ik, replace(POLICY, reach={"LElbow": 5.0}))
+    near = module._build(ik, replace(POLICY, reach={"LElbow": 0.1}))
+    assert near.step["left_arm"] == pytest.approx(0.3 * far.step["left_arm"])
+    assert near.step["right_arm"] == far.step["right_arm"]
+
+
+def test_an_obstacle_beyond_reach_says_how_far_to_walk(robot):
+    with pytest.raises(InputError, match=r"must first walk 0\.77 m"):
+        plan_traverse(POLICY, robot, scene(face=1.0))
+
+
+def test_a_box_too_high_a_goal_on_it_and_a_policy_without_a_way_are_refused(robot):
+    high = scene(height=2.0)
+    with pytest.raises(InputError, match=r"boxes\.table is '2\.00 m high'"):
+        plan_traverse(POLICY, robot, high)
+    with pytest.raises(InputError, match=r"boxes\.table is '2\.00 m high'"):
+        plan_traverse(POLICY, robot, scene(height=2.0, goal=[0.5, 0.0]))
+    flat = replace(POLICY, options=POLICY.options[-1:])
+    with pytest.raises(InputError, match="cycle on the obstacle"):
+        plan_traverse(flat, robot, scene())
+
+
+@pytest.mark.slow
+def test_on_bare_ground_it_steps_to_the_goal_and_stands(robot):
+    bare = Scene(start=np.zeros(3), goal=np.array([0.3, 0.1, 0.5]))
+    plan = plan_traverse(POLICY, robot, bare)
+    assert plan.complete
+    last = plan.keyframes[-1]
+    assert {c.surface for c in last.stance} == {"LFoot", "RFoot"}
+    assert np.linalg.norm(last.q[:2] - [0.3, 0.1]) < 0.1
+    assert {i.option for i in plan.iterations} == {"ac4"}
+
+
+@pytest.mark.slow
+def test_changes_are_bounded_and_the_plan_says_so(robot):
+    plan = plan_traverse(POLICY, robot, scene(), options=PlanOptions(max_changes=3))
+    assert not plan.complete
+    assert "3 contact changes were not enough" in plan.skipped[-1].reason
+
+
+@pytest.mark.slow
+def test_a_box_is_crossed_and_the_robot_stands_beyond_it(crossing):
+    assert crossing.complete
+    start, last = crossing.keyframes[0], crossing.keyframes[-1]
+    assert all(c.support == GROUND for c in last.stance)
+    assert {c.surface for c in last.stance} == {"LFoot", "RFoot"}
+    assert last.q[0] > 0.83
+    assert last.q[2] > 0.8 * start.q[2]
+    on_top = [all(c.support == "table" for c in k.stance) for k in crossing.keyframes]
+    assert any(on_top)
+
+
+@pytest.mark.slow
+def test_every_posture_of_a_crossing_keeps_its_contacts(crossing):
+    kin = Kinematics(crossing.world)
+    for before, path, after in zip(
+        crossing.keyframes, crossing.paths, crossing.keyframes[1:], strict=False
+    ):
+        np.testing.assert_array_equal(path.phases[0].q[0], before.q)
+        np.testing.assert_array_equal(path.phases[-1].q[-1], after.q)
+        for phase in path.phases:
+            for q in phase.q:
+                kin.update(q)
+                assert max(contact_drift(kin, c) for c in phase.contacts) < 0.005
+
+
+@pytest.mark.slow
+def test_cycles_follow_one_another_as_in_the_policy_and_the_cost_falls(crossing):
+    assert len(crossing.iterations) == len(crossing.paths)
+    names = [i.option for i in crossing.iterations]
+    runs = [n for k, n in enumerate(names) if k == 0 or names[k - 1] != n]
+    assert runs[:3] == ["ac1", "ac2", "ac3"]
+    assert "ac1" in runs[3:]
+    costs = [i.cost for i in crossing.iterations]
+    assert costs[-1] < 0.1 < costs[0]
+
+
+@pytest.mark.slow
+def test_a_policy_goes_on_from_any_stance_on_the_way(crossing):
+    middle = next(
+        k
+        for k in crossing.keyframes
+        if all(c.support == "table" for c in k.stance) and len(k.stance) == 4
+    )
+    found = follow_policy(IK(crossing.world), POLICY, middle, PlanOptions(), changes=4)
+    assert not found.missed
+    assert not found.arrived
+    assert len(found.paths) >= 4
+    assert found.keyframes[0] is middle
+
+
+@pytest.mark.slow
+def test_a_plan_with_its_policy_survives_disk(crossing, tmp_path):
+    save_plan(crossing, tmp_path)
+    again = load_plan(tmp_path)
+    assert again.policy is not None
+    assert again.policy.options == POLICY.options
+    assert again.iterations == crossing.iterations
