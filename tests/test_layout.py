@@ -56,6 +56,7 @@ LAYERS = [
     "viz",
     "curves",
     "view",
+    "meshes",
     "report",
     "",  # the package itself: its public names
     "cli",

@@ -206,8 +206,8 @@ def test_a_surface_stands_on_the_support_below_it(plan: Plan, rollout: Rollout):
 
 def test_contact_in_the_plot_begins_and_ends_with_the_load():
     mask = np.array([1, 1, 0, 0, 1, 0, 1], dtype=bool)
-    assert viz._runs(mask) == [(0, 2), (4, 5), (6, 7)]
-    assert viz._runs(np.zeros(3, dtype=bool)) == []
+    assert viz.runs_of(mask) == [(0, 2), (4, 5), (6, 7)]
+    assert viz.runs_of(np.zeros(3, dtype=bool)) == []
 
 
 # Files.

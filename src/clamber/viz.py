@@ -15,7 +15,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -40,6 +40,13 @@ from clamber.statics import com_margin, projected_distance, support_polygon, the
 
 AZIMUTH, ELEVATION = 288.0, -17.0  # [deg] from the left, a little behind: the box hides
 # neither the feet on the ground nor the hands on its top
+PRESETS: Mapping[str, tuple[float, float]] = {  # [deg] azimuth and elevation; a robot
+    "corner": (AZIMUTH, ELEVATION),  # that faces along x is seen from there
+    "side": (270.0, -8.0),
+    "front": (180.0, -14.0),
+    "behind": (0.0, -20.0),
+    "top": (270.0, -89.0),
+}
 MARGIN = 0.08  # share of the picture left free around what must be seen
 EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
 GROUND_SHOWN = 5.5  # [m] half width of the ground in pictures
@@ -513,7 +520,7 @@ def contact_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
     loaded = loaded_surfaces(world, rollout)
     tracks = {s: heights[:, i] for i, s in enumerate(rollout.surfaces)}
     contact = {
-        s: [(rollout.time[a], rollout.time[b - 1]) for a, b in _runs(loaded[:, i])]
+        s: [(rollout.time[a], rollout.time[b - 1]) for a, b in runs_of(loaded[:, i])]
         for i, s in enumerate(rollout.surfaces)
     }
     panels = _limb_panels(world.robot)
@@ -540,7 +547,7 @@ def loaded_surfaces(world: World, rollout: Rollout) -> np.ndarray:
     return force > LOADED * world.mass * 9.81
 
 
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+def runs_of(mask: np.ndarray) -> list[tuple[int, int]]:
     """Half-open ranges in which a boolean (M,) mask is true."""
     steps = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return list(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
@@ -624,15 +631,32 @@ def stability_over_time(
         limit: (n, nS) l sin(theta_max) in the present posture [m].
         margin: (n,) of the centre of mass [m], NaN where nothing is loaded.
     """
-    kin = Kinematics(world)
     loaded = loaded_surfaces(world, rollout)[rows]
+    return stability_of(world, rollout.qpos[rows], loaded, rollout.surfaces)
+
+
+def stability_of(
+    world: World, postures: np.ndarray, loaded: np.ndarray, surfaces: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geometric stability (4.17) of postures (n, nq) on the surfaces that bear.
+
+    Args:
+        world: Robot and supports.
+        postures: (n, nq).
+        loaded: (n, nS) bool, the surfaces that bear.
+        surfaces: Names of the nS surfaces.
+
+    Returns:
+        As `stability_over_time`.
+    """
+    kin = Kinematics(world)
     d = np.full(loaded.shape, np.nan)
-    limit, margin = d.copy(), np.full(len(rows), np.nan)
-    for i, row in enumerate(rows):
-        kin.update(rollout.qpos[row])
+    limit, margin = d.copy(), np.full(len(postures), np.nan)
+    for i, q in enumerate(postures):
+        kin.update(q)
         bearing = []
         for j in np.flatnonzero(loaded[i]):
-            surface = rollout.surfaces[j]
+            surface = surfaces[j]
             support = support_below(world, kin, surface)
             point = kin.contact_point(surface, support.normal)
             mass = kin.landmark(world.robot.limb_of(surface).root)[1]
