@@ -59,6 +59,7 @@ from clamber.viz import (
     PRESETS,
     describe_move,
     loaded_surfaces,
+    near_edge_points,
     robot_corners,
     runs_of,
     stability_of,
@@ -70,7 +71,7 @@ PERSON = "demonstration.png"  # of the recording, which is not in the folder
 MAX_PICTURE = 1_000_000  # [bytes] larger ones are left out
 SAMPLES_A_SECOND = 25
 MAX_POSES = 1_200_000  # [bytes] of one run's poses; longer runs are sampled more coarsely
-SHORTEST_LOAD = 0.06  # [s] a shorter touch or gap is no contact event
+SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
 SHARP = 32767  # the largest packed number; one below the smallest stands for none
 _Loaded = TypeVar("_Loaded")
 
@@ -450,7 +451,7 @@ def _motion(
     schedule = [] if reference is None else _spells(reference.time, reference.contact)
     loads = None
     if rollout is not None:
-        loads = _spells(rollout.time, loaded_surfaces(world, rollout), SHORTEST_LOAD)
+        loads = _spells(rollout.time, steadily_loaded(rollout))
     schedule = [[(a, min(b, end)) for a, b in x if a < end] for x in schedule]
     switches = {t for x in loads or schedule for pair in x for t in pair}
     return {
@@ -459,7 +460,7 @@ def _motion(
         "arrays": arrays,
         "meshes": [_mesh_record(m) for m in meshes],
         "edges": _box_edges(world.model),
-        "bounds": _bounds(world, kin, q),
+        "seen": _seen(world, kin, q),
         "start": float(world.scene.start[2]),
         "reach": reach,
         "weight": world.mass * 9.81,
@@ -497,7 +498,7 @@ def _physics(
     effort = rollout.actuator_force[:, order] / world.tau_max
     size = np.linalg.norm(rollout.contact_force, axis=2)
     out: dict[str, np.ndarray | None] = {
-        "loaded": loaded_surfaces(world, rollout)[rows].astype(float),
+        "loaded": steadily_loaded(rollout)[rows].astype(float),
         "force": rollout.contact_force[rows],
         "size": _peaks(size, rows),
         "effort": _peaks(effort, rows),
@@ -555,30 +556,44 @@ def _poses(kin: Kinematics, meshes: list[Mesh], q: np.ndarray) -> np.ndarray:
     return out
 
 
-def _bounds(world: World, kin: Kinematics, q: np.ndarray) -> np.ndarray:
-    """(2, 3) lowest and highest corner of all places the robot takes [m]."""
+def _seen(world: World, kin: Kinematics, q: np.ndarray) -> np.ndarray:
+    """(m, 3) points that a camera has to have in view [m].
+
+    They are the corners of boxes around some postures, and the near edge.
+    """
     corners = []
-    for posture in q[np.unique(np.linspace(0, len(q) - 1, 60).astype(int))]:
+    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    for posture in q[np.unique(np.linspace(0, len(q) - 1, 40).astype(int))]:
         kin.update(posture)
-        corners.append(robot_corners(kin))
-    points = np.concatenate(corners)
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+        points = robot_corners(kin)
+        low, high = points.min(axis=0), points.max(axis=0)
+        corners.append(low + sides * (high - low))
+    return np.concatenate([*corners, near_edge_points(world.scene)]).round(3)
 
 
-def _spells(
-    time: np.ndarray, contact: np.ndarray, shortest: float = 0.0
-) -> list[list[tuple[float, float]]]:
+def steadily_loaded(rollout: Rollout) -> np.ndarray:
+    """(M, nS) bool, the surfaces that bear; gaps, then touches, below 60 ms left out.
+
+    A stiff contact that rolls is without force for a step now and then.
+    """
+    loaded = loaded_surfaces(rollout.world, rollout)
+    last = len(rollout.time) - 1
+    step = float(rollout.time[-1] - rollout.time[0]) / max(last, 1)
+    for column in loaded.T:
+        for state in (True, False):
+            for a, b in runs_of(column != state):
+                if 0 < a and b <= last and (b - a) * step < SHORTEST_LOAD:
+                    column[a:b] = state
+    return loaded
+
+
+def _spells(time: np.ndarray, contact: np.ndarray) -> list[list[tuple[float, float]]]:
     """For each surface (columns) from when to when it is in contact [s]."""
-    out = []
-    for column in contact.T:
-        spells: list[tuple[float, float]] = []
-        for a, b in runs_of(column):
-            t0, t1 = float(time[a]), float(time[min(b, len(time) - 1)])
-            if spells and t0 - spells[-1][1] < shortest:
-                t0 = spells.pop()[0]
-            spells.append((t0, t1))
-        out.append([(a, b) for a, b in spells if b - a >= shortest])
-    return out
+    last = len(time) - 1
+    return [
+        [(float(time[a]), float(time[min(b, last)])) for a, b in runs_of(column)]
+        for column in contact.T
+    ]
 
 
 def _box_edges(model: mujoco.MjModel) -> list[float]:

@@ -18,7 +18,7 @@ function el(tag, attributes = {}, ...children) {
     else if (key === "style") Object.entries(value).forEach(([k, v]) => made.style.setProperty(k, v));
     else if (value !== false && value !== null && value !== undefined) made.setAttribute(key, value === true ? "" : value);
   }
-  made.append(...children.flat().filter((c) => c !== null && c !== undefined && c !== false));
+  made.append(...children.flat(Infinity).filter((c) => c !== null && c !== undefined && c !== false));
   return made;
 }
 
@@ -205,7 +205,7 @@ function stage(run, motion, i) {
   if (!motion) return el("p", { class: "warn" }, "Nothing to animate.");
   const canvas = el("canvas", { class: "view", "aria-label": `animation of ${run.title}`, tabindex: "0" });
   let scene = null, reason = "WebGL 2 is not available here: no animation.";
-  try { scene = createScene(canvas, motion.meshes, motion.edges, motion.bounds, motion.start); } catch (e) { reason = `${reason} ${e.message}`; }
+  try { scene = createScene(canvas, motion.meshes, motion.edges, motion.seen, motion.start); } catch (e) { reason = `${reason} ${e.message}`; }
   if (!scene) return el("p", { class: "warn" }, reason);
   const made = { canvas, scene, motion, run };
   SCENES.push(made);
@@ -236,7 +236,7 @@ function transport() {
   const ghost = MOTIONS.some((m) => m && m.arrays.ghost);
   const tick = el("input", { type: "checkbox", id: "ghost", onchange: () => { state.ghost = tick.checked; redraw(); } });
   return el("div", { class: "transport" },
-    el("div", { class: "row" }, button("⏮", "contact before (←)", () => step(-1), "previous"), toggle, button("⏭", "next contact (→)", () => step(1), "next"), slider, clock, speed),
+    el("div", { class: "row" }, button("|◀", "contact before (←)", () => step(-1), "previous"), toggle, button("▶|", "next contact (→)", () => step(1), "next"), slider, clock, speed),
     el("div", { class: "row views" }, DATA.presets.map(view), ghost && el("label", {}, tick, " planned posture"),
       el("span", { class: "hint" }, "drag to turn, Shift-drag to move, wheel or pinch to zoom")));
 }
@@ -282,7 +282,7 @@ function gantt(run, motion) {
   return el("div", { class: "gantt" },
     el("div", { class: "names" }, names.map((name) => el("span", {}, name))),
     el("div", {}, strip(motion.end, names.length * row, shapes), timeAxis(motion.end)),
-    el("p", { class: "note" }, `Thin: planned. ${motion.loads ? "Bold: loaded in physics. " : ""}Dashed lines: keyframes.${motion.felt.length ? " Red: something was felt." : ""} Time in s; drag to scrub.`));
+    el("p", { class: "note" }, `Thin: planned. ${motion.loads ? "Bold: loaded in physics, gaps and touches below 60 ms left out. " : ""}Dashed lines: keyframes.${motion.felt.length ? " Red: something was felt." : ""} Time in s; drag to scrub.`));
 }
 
 // A plot of lines {name, at: row => number, colour, faint, dashed, bold: row => bool}.
@@ -307,7 +307,7 @@ function plot(title, motion, lines, { limits = [], from = null, range, digits = 
   });
   const readings = lines.map((l) => (l.faint ? null : el("b")));
   const legend = el("div", { class: "legend" }, lines.map((l, i) => !l.faint && el("span", {}, el("i", { style: { background: l.colour } }), l.name, " ", readings[i])),
-    limits.map((l) => el("span", { class: "dim" }, el("i", { class: "dash", style: { "border-color": l.colour || "#dc2626" } }), l.name)));
+    limits.map((l) => l.name && el("span", {}, el("i", { class: "dash", style: { "border-color": l.colour || "#dc2626" } }), l.name)));
   watchers.push((t) => { const r = before(motion.times, t); readings.forEach((b, i) => b && (b.textContent = fixed(values[i][r], digits))); });
   const chart = strip(motion.end, height, shapes);
   chart.append(...ticks(low, high, 4).map((v) => el("span", { class: "tick", style: { top: `${(100 * y(v)) / height}%` } }, neat(v))));
@@ -323,7 +323,7 @@ const PLOTS = [
     const most = peaks.slice(0, 5).map(([i]) => i), lines = [];
     m.joints.forEach((name, i) => most.includes(i) || lines.push({ name, faint: true, colour: "#94a3b8", at: (r) => m.arrays.effort(r, i) }));
     most.forEach((i, k) => lines.push({ name: `${m.joints[i]} (${neat(m.effortLimits[i])} N m)`, colour: colourOf([0, 2, 4, 6, 5][k]), at: (r) => m.arrays.effort(r, i) }));
-    return { lines, limits: [{ value: 1, name: "limit" }, { value: -1, name: "" }], at: [-1.08, 1.08] };
+    return { lines, limits: [{ value: 1, name: "limit" }, { value: -1 }], at: [-1.08, 1.08] };
   }],
   ["Centre of mass inside the support polygon [m]", (run, m) => {
     if (!m.arrays.margin) return null;

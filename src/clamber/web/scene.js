@@ -52,7 +52,7 @@ function axesOf(azimuth, elevation) {
 // The nearest camera that has all points in the picture; as `frame_view` of viz.py.
 function fitted(points, azimuth, elevation, aspect, fovy) {
   const { right, up, forward } = axesOf(azimuth, elevation);
-  const half = Math.tan(fovy / 2) * 0.9, place = [];
+  const half = Math.tan(fovy / 2) * 0.93, place = [];
   let nearest = Infinity;
   for (const [axis, t] of [[right, half * aspect], [up, half]]) {
     let low = -Infinity, high = Infinity;
@@ -84,7 +84,7 @@ const FRAGMENT = `#version 300 es
 precision highp float; precision highp sampler2DShadow;
 in vec3 p, n, c; in vec4 s; out vec4 colour;
 uniform sampler2DShadow depths; uniform vec3 eye, sun, sky, earth, tint; uniform vec4 near[12];
-uniform float alpha, tinted, ground, reach, flat_; uniform vec3 base, lines; uniform vec2 centre;
+uniform float alpha, tinted, ground, reach, flat_, spread; uniform vec3 base, lines; uniform vec2 centre;
 const vec2 taps[16] = vec2[16](vec2(-.94,-.4),vec2(.95,-.77),vec2(-.09,-.93),vec2(.34,.29),vec2(-.92,.46),
   vec2(-.82,-.88),vec2(-.38,.28),vec2(.97,.76),vec2(.44,-.98),vec2(.54,-.47),vec2(-.26,-.42),vec2(.79,.19),
   vec2(-.24,1.),vec2(-.81,.91),vec2(.2,.79),vec2(.14,-.14));
@@ -94,7 +94,7 @@ float lit(float facing) {
   float turn = 6.2832 * fract(52.98 * fract(dot(gl_FragCoord.xy, vec2(.0671, .00584)))), sum = 0.0;
   mat2 R = mat2(cos(turn), sin(turn), -sin(turn), cos(turn));
   for (int i = 0; i < 16; i++)
-    sum += texture(depths, vec3(q.xy + R * taps[i] * 0.0032, q.z - 0.0015 - 0.004 * (1.0 - facing)));
+    sum += texture(depths, vec3(q.xy + R * taps[i] * spread, q.z - 0.0008 - 0.0025 * (1.0 - facing)));
   return sum / 16.0;
 }
 float open() {
@@ -106,17 +106,17 @@ float open() {
 }
 float grid(vec2 x, float cell, float wide) {
   vec2 g = abs(fract(x / cell - 0.5) - 0.5) * cell, w = fwidth(x);
-  vec2 a = (1.0 - smoothstep(wide * 0.5, wide * 0.5 + w, g)) * min(vec2(1.0), wide / w + 0.35);
+  vec2 a = (1.0 - smoothstep(vec2(wide * 0.5), wide * 0.5 + w, g)) * min(vec2(1.0), wide / w + 0.35);
   return max(a.x, a.y);
 }
 void main() {
   vec3 albedo = ground > 0.5 ? base : mix(c * c, tint, tinted), N = normalize(n), E = normalize(eye - p);
-  if (flat_ > 0.5) { colour = vec4(tint, alpha); return; }
+  if (flat_ > 0.5) { colour = vec4(sqrt(tint), alpha); return; }
   if (dot(N, E) < 0.0) N = -N;
   float facing = max(dot(N, sun), 0.0), shade = facing > 0.0 ? lit(facing) : 0.0, o = open();
   vec3 ambient = mix(earth, sky, 0.5 + 0.5 * N.z) * o;
   vec3 back = vec3(0.10) * max(dot(N, normalize(vec3(-sun.xy, 0.35))), 0.0);
-  vec3 x = albedo * (ambient + back + facing * shade * vec3(1.32, 1.26, 1.16));
+  vec3 x = albedo * (ambient + back + facing * shade * vec3(1.06, 1.01, 0.93));
   if (ground > 0.5) {
     float far = length(p.xy - centre) / reach;
     x = albedo * mix(0.62, 1.0, shade) * mix(0.45, 1.0, o);
@@ -197,7 +197,7 @@ function along(way, wide, long, p) {
 
 // The renderer of one run on one canvas. `draw(picture)` shows
 // {poses: [matrix a mesh], ghost: same or null, discs: [{p, n, colour}], arrows: [{p, f, colour}]}.
-function createScene(canvas, meshes, edges, bounds, start) {
+function createScene(canvas, meshes, edges, seen, start) {
   const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
   if (!gl) return null;
   const look = program(gl, VERTEX, FRAGMENT), dark = program(gl, DEPTH_VERTEX, DEPTH_FRAGMENT);
@@ -215,12 +215,19 @@ function createScene(canvas, meshes, edges, bounds, start) {
   gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, shadow, 0);
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
 
-  const [low, high] = bounds, middle = V.scale(V.add(low, high), 0.5);
-  const radius = 0.5 * Math.hypot(...V.sub(high, low));
-  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => [0, 1, 2].map((k) => ((i >> k) & 1 ? high : low)[k]));
+  // Shadows reach as far as what stands nearby; a hall around the robot has none.
+  const low = [0, 1, 2].map((k) => Math.min(...seen.map((p) => p[k]))), high = [0, 1, 2].map((k) => Math.max(...seen.map((p) => p[k])));
+  const middle = V.scale(V.add(low, high), 0.5), radius = 0.5 * Math.hypot(...V.sub(high, low));
+  let wide = radius;
+  for (const m of meshes) {
+    if (m.body > 0) continue;
+    for (let i = 0; i < m.vertices.length; i += 3)
+      wide = Math.max(wide, Math.hypot(...V.sub([0, 1, 2].map((k) => m.vertices[i + k] * m.scale), middle)));
+  }
+  wide = Math.min(wide, 3 * radius);
   const sun = V.unit([-0.42 * Math.cos(start) + 0.5 * Math.sin(start), -0.42 * Math.sin(start) - 0.5 * Math.cos(start), 1.15]);
   const lightAxes = (() => { const forward = V.scale(sun, -1), right = V.unit(V.cross(forward, [0, 0, 1])); return [right, V.cross(right, forward), forward]; })();
-  const light = product(orthographic(radius * 1.05, 0.1, 8 * radius), viewMatrix(...lightAxes, V.add(middle, V.scale(sun, 4 * radius))));
+  const light = product(orthographic(wide * 1.05, 0.1, 8 * wide), viewMatrix(...lightAxes, V.add(middle, V.scale(sun, 4 * wide))));
   const FOVY = 0.6;
 
   function solid(part, model, to) {
@@ -258,6 +265,7 @@ function createScene(canvas, meshes, edges, bounds, start) {
     gl.uniform4fv(u.near, near);
     gl.uniform2f(u.centre, middle[0], middle[1]);
     gl.uniform1f(u.reach, 4.5 * radius);
+    gl.uniform1f(u.spread, 0.004 / wide);
     const mark = (alpha, tinted, tint, ground = 0, flat = 0) => {
       gl.uniform1f(u.alpha, alpha); gl.uniform1f(u.tinted, tinted); gl.uniform3fv(u.tint, tint);
       gl.uniform1f(u.ground, ground); gl.uniform1f(u.flat_, flat);
@@ -295,7 +303,7 @@ function createScene(canvas, meshes, edges, bounds, start) {
       }
       for (const a of picture.arrows) {
         const long = Math.hypot(...a.f), tip = Math.min(0.05, 0.5 * long), way = V.unit(a.f);
-        mark(alpha, 1, a.colour);
+        mark(Math.max(alpha, 0.6), 1, a.colour, 0, 1);
         solid(shaft, along(way, 0.0075, long - tip, a.p), look);
         solid(head, along(way, 0.02, tip, V.add(a.p, V.scale(way, long - tip))), look);
       }
@@ -305,7 +313,7 @@ function createScene(canvas, meshes, edges, bounds, start) {
     gl.disable(gl.BLEND);
   }
 
-  const fit = (azimuth, elevation, aspect) => fitted(corners, azimuth, elevation, aspect, FOVY);
+  const fit = (azimuth, elevation, aspect) => fitted(seen, azimuth, elevation, aspect, FOVY);
   return { draw, fit, radius };
 }
 
