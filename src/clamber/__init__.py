@@ -29,6 +29,7 @@ _HOME = {
     "Outcome": "job",
     "Plan": "pipeline",
     "PlanOptions": "pipeline",
+    "Reported": "report",
     "Robot": "model",
     "Rollout": "simulation",
     "Scene": "scene",
@@ -47,6 +48,7 @@ _HOME = {
     "load_demo": "demo",
     "load_plan": "io",
     "load_robot": "model",
+    "load_rollout": "io",
     "load_scene": "scene",
     "load_sequence": "io",
     "load_spec": "experiment",
@@ -63,6 +65,7 @@ _HOME = {
     "save_verdict": "io",
     "simulate": "simulation",
     "write_c3d": "demo",
+    "write_report": "report",
     "write_trc": "demo",
 }
 

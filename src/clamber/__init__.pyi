@@ -20,6 +20,7 @@ from clamber.experiment import load_spec as load_spec
 from clamber.export import Exported as Exported
 from clamber.export import export_run as export_run
 from clamber.io import load_plan as load_plan
+from clamber.io import load_rollout as load_rollout
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
@@ -38,6 +39,8 @@ from clamber.model import load_robot as load_robot
 from clamber.pipeline import Plan as Plan
 from clamber.pipeline import PlanOptions as PlanOptions
 from clamber.pipeline import plan as plan
+from clamber.report import Reported as Reported
+from clamber.report import write_report as write_report
 from clamber.scene import Box as Box
 from clamber.scene import Scene as Scene
 from clamber.scene import Support as Support

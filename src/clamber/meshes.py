@@ -76,7 +76,9 @@ def body_meshes(
                 body=body,
                 vertices=np.concatenate([v for (v, _, _), _ in parts]),
                 normals=np.concatenate([n for (_, n, _), _ in parts]),
-                colours=np.concatenate([np.tile(c, (len(v), 1)) for (v, _, _), c in parts]),
+                colours=np.concatenate(
+                    [np.tile(c, (len(v), 1)) for (v, _, _), c in parts]
+                ),
                 triangles=np.concatenate(
                     [f + s for ((_, _, f), _), s in zip(parts, starts, strict=False)]
                 ),
@@ -218,7 +220,11 @@ def simplified(vertices: np.ndarray, triangles: np.ndarray, count: int) -> _Tria
     for k in range(3):
         np.add.at(n, f[:, k], np.cross(b - a, c - a))
     length = np.linalg.norm(n, axis=1, keepdims=True)
-    return v, np.where(length > 0, n / np.where(length > 0, length, 1.0), [0, 0, 1.0]), f
+    return (
+        v,
+        np.where(length > 0, n / np.where(length > 0, length, 1.0), [0, 0, 1.0]),
+        f,
+    )
 
 
 def _with_area(v: np.ndarray, f: np.ndarray) -> np.ndarray:

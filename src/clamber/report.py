@@ -37,12 +37,9 @@ from clamber.errors import ClamberError, InputError
 from clamber.io import (
     EXECUTION,
     PLAN,
-    PLANNED_TRAJECTORY,
     ROLLOUT,
     SCENE,
-    SEQUENCE,
     TIMINGS,
-    TRAJECTORY,
     VERDICT,
     load_fields,
     load_plan,
@@ -70,7 +67,9 @@ REPORT = "report.html"
 PERSON = "demonstration.png"  # of the recording, which is not in the folder
 MAX_PICTURE = 1_000_000  # [bytes] larger ones are left out
 SAMPLES_A_SECOND = 25
-MAX_POSES = 1_200_000  # [bytes] of one run's poses; longer runs are sampled more coarsely
+MAX_POSES = (
+    1_200_000  # [bytes] of one run's poses; longer runs are sampled more coarsely
+)
 SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
 SHARP = 32767  # the largest packed number; one below the smallest stands for none
 _Loaded = TypeVar("_Loaded")
@@ -127,9 +126,7 @@ def page(runs: Iterable[Mapping[str, Any]]) -> str:
     runs = list(runs)
     web = files("clamber") / "web"
     read = {n: (web / n).read_text("utf-8") for n in ("report.html", "report.css")}
-    script = "\n".join(
-        (web / n).read_text("utf-8") for n in ("scene.js", "report.js")
-    )
+    script = "\n".join((web / n).read_text("utf-8") for n in ("scene.js", "report.js"))
     presets = [
         {"name": n, "azimuth": a, "elevation": e} for n, (a, e) in PRESETS.items()
     ]
@@ -425,14 +422,17 @@ def _motion(
     kin = Kinematics(world)
     q_ref = series.pop("reference", None)
     series |= _where(world, kin, q)
-    bears = series.get("loaded")
-    bears = series["planned"] if bears is None else bears
+    planned, bears = series["planned"], series.get("loaded")
+    bears = planned if bears is None else bears
     assert bears is not None
-    d, limit, margin = stability_of(world, q, bears > 0, tuple(world.surfaces))
+    marked = bears > 0 if planned is None else (bears > 0) | (planned > 0)
+    d, limit, margin = stability_of(world, q, marked, tuple(world.surfaces))
+    other = np.any(marked != (bears > 0), axis=1)  # what bears nothing holds no CoM
+    margin[other] = stability_of(
+        world, q[other], bears[other] > 0, tuple(world.surfaces)
+    )[2]
     series["ratio"], series["margin"] = d / limit, margin
-    if q_ref is not None and series.get("planned") is not None:
-        planned = series["planned"]
-        assert planned is not None
+    if q_ref is not None and planned is not None:
         series["plannedMargin"] = stability_of(
             world, q_ref, planned > 0, tuple(world.surfaces)
         )[2]

@@ -221,7 +221,8 @@ function stage(run, motion, i) {
     const clock = motion.stills ? `keyframe ${before(motion.times, t)}` : `${fixed(Math.min(t, motion.end), 2)} s`;
     caption.textContent = shown && !motion.stills ? `${clock} — after: ${shown.move}` : clock;
   });
-  return [el("div", { class: "stage" }, canvas, caption), legend];
+  made.paper = el("canvas", { class: "paper", "aria-hidden": "true" });
+  return [el("div", { class: "stage" }, canvas, made.paper, caption), legend];
 }
 
 function transport() {
@@ -380,14 +381,21 @@ function sheet(run, motion, i) {
     el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, holds a push of ${fixed(k.margin, 2)} weights`, k.time === null && el("em", {}, " — not reached")))));
 }
 
-// The tiles are drawn by the renderers of the animations, once for each theme.
-function drawSheets() {
+// Stills are drawn by the renderer of the animation: keyframes, once for each theme, and
+// the present picture for paper, since browsers print an older one of a WebGL canvas.
+function still(s, onto, picture, camera) {
+  s.scene.draw(picture, camera, theme(), onto.width, onto.height);
+  onto.getContext("2d").drawImage(s.canvas, 0, 0);
+}
+function drawStills() {
+  const preset = DATA.presets[0];
   for (const tile of document.querySelectorAll("canvas[data-keyframe]")) {
     const s = SCENES.find((x) => x.run === RUNS[Number(tile.dataset.run)]);
-    const [width, height] = [s.canvas.width, s.canvas.height], preset = DATA.presets[0];
-    s.scene.draw(s.motion.keyframe(Number(tile.dataset.keyframe)), s.scene.fit(preset.azimuth, preset.elevation, tile.width / tile.height), theme(), tile.width, tile.height);
-    tile.getContext("2d").drawImage(s.canvas, 0, 0);
-    [s.canvas.width, s.canvas.height] = [width, height];
+    still(s, tile, s.motion.keyframe(Number(tile.dataset.keyframe)), s.scene.fit(preset.azimuth, preset.elevation, tile.width / tile.height));
+  }
+  for (const s of SCENES) {
+    [s.paper.width, s.paper.height] = [1600, 800];
+    if (printing) still(s, s.paper, s.motion.at(state.t, state.ghost), cameraOf(s, 2));
   }
   paint();
 }
@@ -432,7 +440,7 @@ function build() {
     const act = { " ": () => play(!state.playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1) }[e.key];
     if (act) { e.preventDefault(); act(); }
   });
-  const restyle = () => { if (SCENES.length) drawSheets(); };
+  const restyle = () => { if (SCENES.length) drawStills(); };
   night.addEventListener("change", restyle);
   const paper = (on) => { printing = on; restyle(); };
   addEventListener("beforeprint", () => paper(true));

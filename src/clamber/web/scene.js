@@ -198,7 +198,7 @@ function along(way, wide, long, p) {
 // The renderer of one run on one canvas. `draw(picture)` shows
 // {poses: [matrix a mesh], ghost: same or null, discs: [{p, n, colour}], arrows: [{p, f, colour}]}.
 function createScene(canvas, meshes, edges, seen, start) {
-  const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
   if (!gl) return null;
   const look = program(gl, VERTEX, FRAGMENT), dark = program(gl, DEPTH_VERTEX, DEPTH_FRAGMENT);
   const solids = meshes.map((m) => ({ ...upload(gl, m.vertices, m.normals, m.colours, m.triangles), scale: m.scale, body: m.body }));
