@@ -1089,7 +1089,7 @@ _KINDS: dict[str, type[pydantic.BaseModel]] = {
 
 
 def load_fields(folder: str | Path, name: str) -> dict[str, Any]:
-    """What a JSON file of a run folder says, as it is written, once it has been checked.
+    """What a JSON file of a run folder says, as it is written, once it is checked.
 
     For what is shown of a run whose other files are missing or broken.
 

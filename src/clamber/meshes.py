@@ -18,6 +18,8 @@ import numpy as np
 SLICES, STACKS = 28, 8  # around a round geom, and over each half of it
 SHOWN_GROUPS = (0, 1, 2)  # of geoms, in MuJoCo's viewer
 MAX_TRIANGLES = 60_000  # of all mesh geoms together
+CREASE = math.radians(40.0)  # an edge that turns by more is sharp
+AROUND = 64  # faces around a vertex that are looked at
 PLAIN = (0.5, 0.5, 0.5, 1.0)  # a geom's colour where it has none: its material's counts
 
 
@@ -179,22 +181,52 @@ def _box(size: np.ndarray) -> _Triangles:
 
 
 def _mesh(model: mujoco.MjModel, mesh: int, keep: float) -> _Triangles:
-    """A mesh asset with the normals that MuJoCo gave it, or simplified."""
+    """A mesh asset, as it is or simplified.
+
+    Its own normals are not used: MuJoCo averages those of a coarse mesh over its edges.
+    """
     start, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     vertex = model.mesh_face[start : start + count].astype(int)
     first = int(model.mesh_vertadr[mesh])
     v = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])].astype(float)
     if keep < 1.0:
-        return simplified(v, vertex, max(4, int(keep * count)))
-    normal = model.mesh_facenormal[start : start + count].astype(int)
-    first = int(model.mesh_normaladr[mesh])
-    n = model.mesh_normal[first : first + int(model.mesh_normalnum[mesh])].astype(float)
-    pairs = np.stack([vertex.ravel(), normal.ravel()], axis=1)
-    unique, index = np.unique(pairs, axis=0, return_inverse=True)
-    return v[unique[:, 0]], n[unique[:, 1]], index.reshape(-1, 3)
+        v, vertex = simplified(v, vertex, max(4, int(keep * count)))
+    return shaded(v, vertex)
 
 
-def simplified(vertices: np.ndarray, triangles: np.ndarray, count: int) -> _Triangles:
+def shaded(vertices: np.ndarray, triangles: np.ndarray) -> _Triangles:
+    """Normals for a mesh: smooth over its faces, but not across a sharp edge.
+
+    The normal at a corner is the mean, weighted by area, of the faces around its vertex
+    that are less than `CREASE` away from the corner's own.
+    """
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    length = np.linalg.norm(area, axis=1, keepdims=True)
+    face = np.repeat(np.arange(len(triangles)), 3)
+    order = np.argsort(triangles.ravel(), kind="stable")
+    corner = triangles.ravel()[order]
+    own, weight = (area / np.maximum(length, 1e-12))[face[order]], area[face[order]]
+    total = weight.copy()
+    for k in range(1, AROUND):
+        i = np.flatnonzero(corner[k:] == corner[:-k])
+        if not len(i):
+            break
+        i = i[np.einsum("ij,ij->i", own[i], own[i + k]) > math.cos(CREASE)]
+        total[i] += weight[i + k]
+        total[i + k] += weight[i]
+    normal = np.empty_like(total)
+    normal[order] = total / np.maximum(
+        np.linalg.norm(total, axis=1, keepdims=True), 1e-12
+    )
+    key = np.column_stack([triangles.ravel(), np.round(normal * 100)]).astype(int)
+    _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return vertices[triangles.ravel()[first]], normal[first], index.reshape(-1, 3)
+
+
+def simplified(
+    vertices: np.ndarray, triangles: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """At most `count` triangles: vertices in one cell of a grid become their mean.
 
     The grid is coarsened until that holds, at the latest when all is in one cell.
@@ -215,16 +247,7 @@ def simplified(vertices: np.ndarray, triangles: np.ndarray, count: int) -> _Tria
         if len(f) <= count or cells == 1:
             break
         cells = max(1, int(cells / 1.4))
-    n = np.zeros_like(v)
-    a, b, c = (v[f[:, k]] for k in range(3))
-    for k in range(3):
-        np.add.at(n, f[:, k], np.cross(b - a, c - a))
-    length = np.linalg.norm(n, axis=1, keepdims=True)
-    return (
-        v,
-        np.where(length > 0, n / np.where(length > 0, length, 1.0), [0, 0, 1.0]),
-        f,
-    )
+    return v, f
 
 
 def _with_area(v: np.ndarray, f: np.ndarray) -> np.ndarray:

@@ -3,8 +3,8 @@
 The file fetches nothing. Python reads the records, samples the motion and writes it as
 packed arrays into a template; what is drawn from them is in `web/`: `scene.js` is the
 renderer, `report.js` builds the page. Names in a run folder are somebody's input: they
-travel as JSON that cannot end its element, and are set as text alone; a content security
-policy runs our script and no other.
+travel as JSON that cannot end its element, and are set as text alone; a content
+security policy runs our script and no other.
 
 A run whose files are broken or missing is shown as far as it can be read.
 
@@ -226,7 +226,7 @@ def run_record(folder: Path) -> dict[str, Any]:
     motion = None
     if plan is not None:
         motion = _motion(plan, rollout, execution)
-    times = [None] * len(written.get("keyframes", []))
+    times: list[float | None] = [None] * len(written.get("keyframes", []))
     if plan is not None:
         times = keyframe_times(plan, rollout)
     name = written.get("robot", {}).get("name")
@@ -260,7 +260,7 @@ def _facts(written: Mapping[str, Any]) -> list[str]:
     """What the scene is, in a few words."""
     boxes = written.get("sequence", {}).get("scene", {}).get("boxes", [])
     return [
-        f"{b['name']} {' × '.join(f'{x:g}' for x in b['size'])} m, friction "
+        f"{b['name']} {' x '.join(f'{x:g}' for x in b['size'])} m, friction "
         f"{b['friction']:g}"
         for b in boxes[:3]
     ]
@@ -492,7 +492,7 @@ def _rows(time: np.ndarray, fits: int) -> np.ndarray:
 def _physics(
     rollout: Rollout, reference: Trajectory | None, rows: np.ndarray
 ) -> dict[str, np.ndarray | None]:
-    """Series of what physics made; torques and forces at their peaks between samples."""
+    """Series of what physics made; torques and forces at their peaks."""
     world = rollout.world
     order = [world.model.actuator(name).id for name in world.joints]
     effort = rollout.actuator_force[:, order] / world.tau_max
@@ -517,7 +517,7 @@ def _physics(
 
 
 def _peaks(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n, k) of x (M, k): from each row up to the next one, the value farthest from 0."""
+    """(n, k) of x (M, k), from each row up to the next: the value farthest from 0."""
     high = np.maximum.reduceat(x, rows, axis=0)
     low = np.minimum.reduceat(x, rows, axis=0)
     return np.where(high >= -low, high, low)
@@ -538,7 +538,7 @@ def _where(world: World, kin: Kinematics, q: np.ndarray) -> dict[str, np.ndarray
 
 
 def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> dict[str, np.ndarray]:
-    """(n, 3) largest and root mean square joint error [rad], distance of the base [m]."""
+    """(n, 3) largest and mean square joint error [rad], distance of the base [m]."""
     off = np.abs(q[:, world.qadr] - q_ref[:, world.qadr])
     base = np.linalg.norm(q[:, :3] - q_ref[:, :3], axis=1)
     rms = np.sqrt((off**2).mean(axis=1))

@@ -187,7 +187,7 @@ class Camera:
         model = copy.copy(world.model)  # looks are set here, the world's stay
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         model.vis.quality.offsamples = 4 if smooth and not cutout else 0
-        model.vis.quality.shadowsize = 2048
+        model.vis.quality.shadowsize = 2048 if height < 700 else 8192  # no steps seen
         if not smooth:
             model.vis.quality.numslices, model.vis.quality.numstacks = 16, 8
         # A ground without end is shaded with speckles where the shadow map ends.
@@ -718,7 +718,7 @@ def stability_of(
         kin.update(q)
         bearing = []
         for j in np.flatnonzero(loaded[i]):
-            surface = surfaces[j]
+            surface = surfaces[int(j)]
             support = support_below(world, kin, surface)
             point = kin.contact_point(surface, support.normal)
             mass = kin.landmark(world.robot.limb_of(surface).root)[1]
