@@ -141,15 +141,15 @@ def test_a_simplified_mesh_is_small_and_still_the_same_shape():
 
 
 def test_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
-    w, n, g = shaded(*fine_sphere())
-    at = np.unique(g[1000:-1000])  # not the poles, which are slivers
+    w, n, _ = shaded(*fine_sphere())
+    at = np.abs(w[:, 2]) < 0.9  # not the poles, whose faces are slivers
     assert np.min(np.abs(np.einsum("ij,ij->i", w[at], n[at]))) > 0.999
     assert len(w) < 1.2 * len(fine_sphere()[0])
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1.0)])
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4)]
     quads = np.array([*faces, (1, 5, 7, 3)])
     f = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    w, n, g = shaded(corners, f)
+    w, n, _ = shaded(corners, f)
     assert len(w) == 24
     np.testing.assert_allclose(np.sort(np.abs(n), axis=1), [[0, 0, 1]] * 24, atol=1e-9)
 

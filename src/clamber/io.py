@@ -18,7 +18,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import IO, Any, TypeVar, get_args, get_type_hints
@@ -718,14 +718,15 @@ def _with_assets(world: World, folder: Path) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def load_plan(folder: str | Path, *, with_trajectory: bool = True) -> Plan:
+def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     """Read what `save_plan` wrote, all but the paths.
 
     World and trajectory are the planned ones, whatever a run has made of them since.
 
     Args:
         folder: The run folder.
-        with_trajectory: Without it, the file it lies in may be broken.
+        without: Of `trajectory.npz` and `timings.json`, what is not read: it may be
+            broken then.
 
     Raises:
         InputError: A file is missing, broken, or does not fit the others.
@@ -761,10 +762,10 @@ def load_plan(folder: str | Path, *, with_trajectory: bool = True) -> Plan:
                     value=f"{c.surface} on {c.support}",
                 )
     trajectory = None
-    if with_trajectory and (followed.exists() or file.complete):
+    if TRAJECTORY not in without and (followed.exists() or file.complete):
         trajectory = load_trajectory(followed, world)
     timings: dict[str, float] = {}
-    if (folder / TIMINGS).exists():
+    if TIMINGS not in without and (folder / TIMINGS).exists():
         timings = _read_json(folder / TIMINGS, _TimingsFile).seconds
     return Plan(
         world=world,

@@ -40,6 +40,7 @@ from clamber.io import (
     ROLLOUT,
     SCENE,
     TIMINGS,
+    TRAJECTORY,
     VERDICT,
     load_fields,
     load_plan,
@@ -70,6 +71,7 @@ SAMPLES_A_SECOND = 25
 MAX_POSES = (
     1_200_000  # [bytes] of one run's poses; longer runs are sampled more coarsely
 )
+SAME_POSTURE = 1e-3  # [rad]
 SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
 SHARP = 32767  # the largest packed number; one below the smallest stands for none
 _Loaded = TypeVar("_Loaded")
@@ -201,9 +203,11 @@ def run_record(folder: Path) -> dict[str, Any]:
     ran = reading.has(ROLLOUT)
     plan, rollout = None, None
     if written:
-        plan = reading.attempt(lambda: load_plan(folder))
+        plan = reading.attempt(lambda: load_plan(folder, without=(TIMINGS,)))
         if plan is None and reading.has(SCENE):
-            plan = reading.attempt(lambda: load_plan(folder, with_trajectory=False))
+            plan = reading.attempt(
+                lambda: load_plan(folder, without=(TIMINGS, TRAJECTORY))
+            )
         if ran:
             rollout = reading.attempt(lambda: load_rollout(folder))
             if rollout is None and plan is not None:
@@ -359,7 +363,7 @@ def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
 
     A plan that was adapted has times of its own: there a keyframe is looked for among
     the spells with its contacts, each after the one before, and is where the reference
-    is nearest to its posture.
+    is nearest to its posture, for the last time.
     """
     if plan.trajectory is None:
         if rollout is None:  # the keyframes alone, a second each
@@ -385,7 +389,8 @@ def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
             now = {s for s, x in zip(followed.surfaces, row, strict=True) if x}
             if now == wanted and followed.time[a] <= end:
                 gap = np.abs(followed.q[a:b, joints] - key.q[joints]).max(axis=1)
-                found, first = min(float(followed.time[a + gap.argmin()]), end), k + 1
+                last = np.flatnonzero(gap <= gap.min() + SAME_POSTURE)[-1]
+                found, first = min(float(followed.time[a + last]), end), k + 1
                 break
         times.append(found)
     return times
@@ -476,7 +481,7 @@ def _motion(
         "marginAsked": plan.options.keyframe.balance_margin,
         "schedule": schedule or [[] for _ in world.surfaces],
         "loads": loads,
-        "events": sorted({round(t, 3) for t in switches if 0 < t < end}),
+        "events": sorted({round(t, 3) for t in switches if SHORTEST_LOAD < t < end}),
         "felt": [e["time"] for e in execution.get("events", []) if e["time"] <= end],
     }
 
@@ -484,8 +489,8 @@ def _motion(
 def _rows(time: np.ndarray, fits: int) -> np.ndarray:
     """Indices of samples, evenly spaced, the last one among them."""
     duration = float(time[-1] - time[0])
-    count = min(fits, max(2, math.ceil(duration * SAMPLES_A_SECOND)))
-    step = max(1, math.ceil((len(time) - 1) / (count - 1)))
+    gaps = min(fits - 1, max(1, round(duration * SAMPLES_A_SECOND)))
+    step = max(1, math.ceil((len(time) - 1) / gaps))
     return np.unique(np.append(np.arange(0, len(time), step), len(time) - 1))
 
 
