@@ -389,7 +389,8 @@ def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
             now = {s for s, x in zip(followed.surfaces, row, strict=True) if x}
             if now == wanted and followed.time[a] <= end:
                 gap = np.abs(followed.q[a:b, joints] - key.q[joints]).max(axis=1)
-                last = np.flatnonzero(gap <= gap.min() + SAME_POSTURE)[-1]
+                near = np.flatnonzero(gap <= gap.min() + SAME_POSTURE)
+                last = near[-1] if times else 0  # the run begins with the first one
                 found, first = min(float(followed.time[a + last]), end), k + 1
                 break
         times.append(found)
