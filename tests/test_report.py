@@ -562,8 +562,9 @@ def test_the_cursors_of_the_plots_follow_the_time(page: tuple[Any, list[str]]):
     left = p.eval_on_selector_all(".cursor", "all => all.map((c) => c.style.left)")
     assert len(left) == 9  # the timeline and eight plots
     assert {round(float(x.rstrip("%"))) for x in left} == {25}
-    box = p.locator(".plot .chart").first.bounding_box()
-    p.mouse.click(box["x"] + box["width"] / 2, box["y"] + 20)
+    chart = p.locator(".plot .chart").first
+    middle = chart.bounding_box()["width"] / 2
+    chart.click(position={"x": middle, "y": 60})
     assert p.evaluate("state.t / END") == pytest.approx(0.5, abs=0.01)
 
 

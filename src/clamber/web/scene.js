@@ -313,7 +313,7 @@ function createScene(canvas, meshes, edges, seen, start) {
     gl.disable(gl.BLEND);
   }
 
-  const fit = (azimuth, elevation, aspect) => fitted(seen, azimuth, elevation, aspect, FOVY);
+  const fit = (azimuth, elevation, aspect) => fitted(seen, azimuth + (180 / Math.PI) * start, elevation, aspect, FOVY);
   return { draw, fit, radius };
 }
 
