@@ -381,6 +381,26 @@ def test_another_robots_rollout_is_not_mistaken_for_this_ones(run: Path):
     assert record["motion"]["loads"] is None
 
 
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("plan.json", '"com_margin": ', '"com_margin": "x", "was": '),
+        ("plan.json", '"friction": 0.8', '"friction": "0.8"'),
+        ("verdict.json", '"limit": 1.0', '"limit": "1.0"'),
+        ("execution.json", '"fell": false', '"fell": []'),
+    ],
+)
+def test_a_field_that_does_not_fit_is_named(
+    run: Path, name: str, before: str, after: str
+):
+    text = (run / name).read_text()
+    assert before in text
+    (run / name).write_text(text.replace(before, after, 1))
+    missing = report.run_record(run)["missing"]
+    field = before.split('"')[1]
+    assert [m for m in missing if m.startswith(f"{name}: ") and field in m]
+
+
 def test_a_picture_that_is_none_is_left_out(run: Path):
     picture = run / "demonstration.png"
     Image.new("RGB", (8, 8)).save(picture)

@@ -1104,4 +1104,9 @@ def load_fields(folder: str | Path, name: str) -> dict[str, Any]:
     """
     path = Path(folder) / name
     _read_json(path, _KINDS[name])
-    return json.loads(path.read_text())
+    text = path.read_text()
+    try:  # what is read as it is written has numbers for numbers
+        _KINDS[name].model_validate_json(text, strict=True)
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    return json.loads(text)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import importlib.metadata
 import io as bytes_io
 import json
 import math
@@ -31,7 +32,6 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from clamber import __version__
 from clamber.contact import Contact
 from clamber.errors import ClamberError, InputError
 from clamber.io import (
@@ -132,7 +132,11 @@ def page(runs: Iterable[Mapping[str, Any]]) -> str:
     presets = [
         {"name": n, "azimuth": a, "elevation": e} for n, (a, e) in PRESETS.items()
     ]
-    data = {"version": __version__, "presets": presets, "runs": runs}
+    data = {
+        "version": importlib.metadata.version("clamber"),
+        "presets": presets,
+        "runs": runs,
+    }
     digest = hashlib.sha256(script.encode()).digest()
     return string.Template(read["report.html"]).substitute(
         title=html.escape(" against ".join(str(r["title"]) for r in runs)),
