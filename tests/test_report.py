@@ -596,6 +596,18 @@ def test_it_prints(page: tuple[Any, list[str]]):
     assert complaints == []
 
 
+def test_a_run_that_ended_at_once_opens(
+    browser: Any, plan: Plan, rollout: Rollout, tmp_path: Path
+):
+    io.save_plan(plan, tmp_path)
+    arrays = ("time", "qpos", "qvel", "actuator_force", "contact_force", "unintended")
+    first = {name: getattr(rollout, name)[:1] for name in arrays}
+    io.save_rollout(plan, replace(rollout, **first, fell=True), tmp_path)
+    p, complaints = opened(browser, report.write_report(tmp_path).file)
+    assert "The robot fell" in p.inner_text("header")
+    assert complaints == []
+
+
 def test_names_are_text_and_no_script(browser: Any, run: Path):
     content = json.loads((run / "plan.json").read_text())
     content["robot"]["name"] = NASTY

@@ -271,7 +271,7 @@ function timeAxis(end) {
 
 function gantt(run, motion) {
   if (!motion || motion.stills) return el("p", { class: "note" }, "No motion, no timeline.");
-  const row = 22, shapes = [], names = motion.surfaces, x = (t) => (1000 * t) / motion.end;
+  const row = 22, shapes = [], names = motion.surfaces, x = (t) => (1000 * t) / (motion.end || 1);
   names.forEach((name, j) => {
     const y = j * row, colour = PALETTE[j % PALETTE.length];
     shapes.push(el("line", { x1: 0, x2: 1000, y1: y + row, y2: y + row, class: "rule" }));
