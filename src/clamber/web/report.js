@@ -406,7 +406,7 @@ function stances(run) {
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
       el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"]))));
   const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "because"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
-  return [table(["", "move", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push [weights]", "limit"], rows, "stances"), ...skipped];
+  return [RUNS.length > 1 && el("h3", {}, run.title), table(["", "move", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push [weights]", "limit"], rows, "stances"), ...skipped];
 }
 
 function verdict(run) {
@@ -428,7 +428,7 @@ function build() {
       section("Contacts", "", gantt),
       RUNS.some((r) => r.keyframes.length) && section("Keyframes", "", sheet, "Click one to see the robot there. Discs and arrows: planned contacts and forces."),
       plots(),
-      section("Stances of the plan", "", stances),
+      section("Stances of the plan", "wide", stances),
       section("Verdict", "", verdict),
       section("Events", "", events),
       RUNS.some((r) => r.picture) && section("The person", "", (run) => (run.picture ? el("img", { src: run.picture, alt: "heights of the person's parts over time" }) : el("p", { class: "note" }, "–"))),
