@@ -3,10 +3,11 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-all fast lint type bench pictures experiments docs build clean
+.PHONY: help demo test test-all test-mujoco3 fast lint type bench pictures experiments docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
+VENV3 := .venv-mujoco3
 # Two workers are enough to hide one slow test; `make test WORKERS=8` uses more.
 WORKERS ?= auto
 # The first Python that is new enough; `make PYTHON=/path/to/python3.12 ...` names another.
@@ -28,6 +29,13 @@ test: $(VENV)/.has-video $(VENV)/.has-test ## every test but the slow ones
 test-all: $(VENV)/.has-video $(VENV)/.has-test ## the slow tests too: whole climbs in physics
 	$(BIN)/python -m pytest -m "not gpu and not network" -n $(WORKERS)
 
+test-mujoco3: | $(BIN)/python ## the tests of `make test` with the last MuJoCo 3, in an environment of their own
+	@[ -x $(VENV3)/bin/python ] || $(BIN)/python -m venv $(VENV3)
+	@grep -v '^mujoco' constraints.txt > $(VENV3)/constraints.txt
+	@$(VENV3)/bin/python -m pip install --quiet --disable-pip-version-check \
+		-c $(VENV3)/constraints.txt 'mujoco<4' -e '.[video,test]'
+	$(VENV3)/bin/python -m pytest -m "not slow and not gpu and not network and not compare" -n $(WORKERS)
+
 fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then what failed last, stops at the first failure
 	@$(BIN)/ruff check --quiet .
 	$(BIN)/python -m pytest -q -x --last-failed --last-failed-no-failures all \
@@ -47,6 +55,9 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	rm -rf build/climb
 	$(BIN)/clamber climb --out build/climb
 	cp build/climb/climb.png docs/climb.png
+	$(BIN)/clamber learn crossing --out build/policy/policy.json
+	cp build/policy/policy.png docs/policy.png
+	cp build/policy/policy-pelvis.png docs/policy-pelvis.png
 	$(BIN)/python -c 'from clamber.viz import cost_shapes; cost_shapes("docs/cost-shapes.png")'
 
 experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)
@@ -68,7 +79,7 @@ build: $(VENV)/.has-dev ## wheel and sdist into dist/, tried out in an empty env
 	rm -rf build/empty
 
 clean: ## remove what make has made, but no runs
-	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV3) build dist site .pytest_cache .ruff_cache
 
 # A stamp for each extra that is installed: nothing is fetched twice, so make works offline afterwards.
 $(VENV)/.has-%: pyproject.toml constraints.txt | $(BIN)/python

@@ -15,11 +15,13 @@ from clamber.adaptation import (
     Adapted,
     adapt_plan,
     feeling,
+    from_here,
     start_again,
 )
 from clamber.errors import Status
 from clamber.model import Kinematics, World, build_world
 from clamber.moves import split_moves
+from clamber.pipeline import Midway
 from clamber.posture.keyframe import bearing_frames, contact_drift
 from clamber.se3 import matrix_from_rpy
 from clamber.statics import com_margin, support_polygon
@@ -62,6 +64,11 @@ def as_felt(contacts, offset, on="box"):
         replace(c, position=c.position + offset) if c.support == on else c
         for c in contacts
     )
+
+
+def midway(made, contacts, q, loaded=None) -> Midway:
+    loaded = contacts if loaded is None else loaded
+    return Midway(made=made, contacts=tuple(contacts), loaded=tuple(loaded), q=q)
 
 
 def described(contacts) -> list[str]:
@@ -194,7 +201,7 @@ def felt(request, fast_plan):
     scene = moved_world(fast_plan.world, offset).scene
     key = fast_plan.keyframes[2]
     contacts = as_felt(key.stance, offset)
-    found = adapt_plan(fast_plan, scene, 2, contacts, contacts, key.q, key.q)
+    found = adapt_plan(fast_plan, scene, midway(2, contacts, key.q), key.q)
     return scene, contacts, found
 
 
@@ -252,9 +259,8 @@ def test_it_goes_on_from_what_is_commanded_and_from_the_base_as_measured(fast_pl
     commanded = key.q.copy()
     commanded[world.qadr] += 0.004 * np.cos(np.arange(len(world.qadr)))
     commanded[:3] += 0.5  # of no use: the base is what was measured
-    found = adapt_plan(
-        fast_plan, world.scene, 2, key.stance, key.stance, key.q, commanded
-    )
+    now = midway(2, key.stance, key.q)
+    found = adapt_plan(fast_plan, world.scene, now, commanded)
     t = found.trajectory
     assert np.allclose(t.q[0, world.qadr], commanded[world.qadr], atol=1e-12)
     assert np.abs(t.q[0, :3] - key.q[:3]).max() < 0.01
@@ -266,7 +272,9 @@ def test_it_goes_on_from_what_is_commanded_and_from_the_base_as_measured(fast_pl
 def test_a_contact_that_does_not_bear_yet_is_loaded_little_by_little(demo_plan):
     world, key = demo_plan.world, demo_plan.keyframes[2]
     loaded = tuple(c for c in key.stance if c.surface != "RHand")
-    found = adapt_plan(demo_plan, world.scene, 2, key.stance, loaded, key.q, key.q)
+    found = adapt_plan(
+        demo_plan, world.scene, midway(2, key.stance, key.q, loaded), key.q
+    )
     kin, t = Kinematics(found.world), found.trajectory
     tau = holding_torque(kin, t.q[0], loaded)
     assert np.allclose(t.tau[0], tau, atol=1e-6)
@@ -286,7 +294,7 @@ def test_with_no_steps_left_there_is_still_the_way_to_a_good_posture(fast_plan):
     offset = (0.0, 0.0, 0.01)
     scene = moved_world(fast_plan.world, offset).scene
     contacts = as_felt(key.stance, offset)
-    found = adapt_plan(fast_plan, scene, 6, contacts, contacts, key.q, key.q)
+    found = adapt_plan(fast_plan, scene, midway(6, contacts, key.q), key.q)
     assert found.missed == ""
     assert described(found.keyframes[0].stance) == described(contacts)
     assert len(found.keyframes) == 1
@@ -300,7 +308,7 @@ def test_a_stance_that_cannot_be_is_said_to_be_none(fast_plan):
     far = as_felt(key.stance[:1], (0.0, 3.0, 0.0), on="ground")
     contacts = (*far, key.stance[1])
     found = adapt_plan(
-        fast_plan, fast_plan.world.scene, 0, contacts, contacts, key.q, key.q
+        fast_plan, fast_plan.world.scene, midway(0, contacts, key.q), key.q
     )
     assert found.trajectory is None
     assert found.keyframes == ()
@@ -312,7 +320,7 @@ def test_a_step_that_has_no_way_is_named(fast_plan, monkeypatch):
     monkeypatch.setattr("clamber.pipeline.VARIATIONS", ({},))
     key = fast_plan.keyframes[0]
     scene = moved_world(fast_plan.world, (3.0, 0.0, 0.0)).scene
-    found = adapt_plan(fast_plan, scene, 0, key.stance, key.stance, key.q, key.q)
+    found = adapt_plan(fast_plan, scene, midway(0, key.stance, key.q), key.q)
     assert found.missed.startswith("air -> LHand on box: ")
     assert len(found.keyframes) < len(fast_plan.keyframes)
 
@@ -320,7 +328,7 @@ def test_a_step_that_has_no_way_is_named(fast_plan, monkeypatch):
 def test_a_support_that_is_believed_gone_is_the_reason(fast_plan):
     key = fast_plan.keyframes[0]
     scene = replace(fast_plan.world.scene, boxes=())
-    found = adapt_plan(fast_plan, scene, 0, key.stance, key.stance, key.q, key.q)
+    found = adapt_plan(fast_plan, scene, midway(0, key.stance, key.q), key.q)
     assert found.trajectory is None
     assert len(found.keyframes) == 1
     assert "box" in found.missed
@@ -343,7 +351,7 @@ def test_where_there_is_no_way_at_the_distance_of_what_is_rough_it_is_not_kept(
     monkeypatch.setattr(adaptation, "_adapt", stub)
     box = world.scene.boxes[0]
     rough = replace(world.scene, boxes=(replace(box, roughness=0.03),))
-    arguments = (0, (), (), world.home, world.home)
+    arguments = (midway(0, (), world.home), world.home)
     keys = fast_plan.keyframes
 
     answers = {True: found("", keys), False: found("no", keys)}
@@ -400,12 +408,9 @@ def test_each_limb_leaves_the_surface_that_it_is_on(demo_plan):
     key = demo_plan.keyframes[2]
     # The left elbow has met the box where the hand was to be.
     other = tuple(
-        replace(s, contact=replace(s.contact, surface="LElbow"))
-        if s.contact.surface == "LHand"
-        else s
-        for s in key.contacts
+        replace(c, surface="LElbow") if c.surface == "LHand" else c for c in key.stance
     )
-    new = adaptation._from_here(steps[2:], replace(key, contacts=other), world)
+    new = from_here(steps[2:], other, world)
     assert [s.move.breaks for s in steps[2:]] == [
         ("LHand",),
         ("RHand",),
@@ -427,15 +432,11 @@ def test_only_the_first_move_of_a_limb_is_another(demo_plan):
     world = demo_plan.world
     steps = split_moves(demo_plan.sequence, world)[0]
     hand = [s for s in steps if s.move.limb == "left_arm"]
-    other = tuple(
-        replace(s, contact=replace(s.contact, surface="LElbow"))
-        for s in demo_plan.keyframes[1].contacts
-        if s.contact.surface == "LHand"
-    )
-    key = replace(demo_plan.keyframes[1], contacts=other)
+    on = demo_plan.keyframes[1].stance
+    other = tuple(replace(c, surface="LElbow") for c in on if c.surface == "LHand")
     later = hand[-1]
-    new = adaptation._from_here([later, later], key, world)
+    new = from_here([later, later], other, world)
     assert [s.move.breaks for s in new] == [("LElbow",), later.move.breaks]
     # A limb that is in the air breaks nothing, whatever is below it.
-    (air,) = adaptation._from_here([hand[0]], key, world)
+    (air,) = from_here([hand[0]], other, world)
     assert hand[0].move.breaks == air.move.breaks == ()

@@ -20,7 +20,8 @@ import clamber
 from clamber import cli
 
 COMMANDS = (
-    *("climb", "contacts", "plan", "simulate", "render", "report", "export"),
+    *("climb", "contacts", "plan", "replan", "simulate", "learn"),
+    *("render", "report", "export"),
     *("scene", "robot", "sweep"),
 )
 
@@ -86,6 +87,10 @@ def test_version_is_that_of_the_package(
         (["climb", "--robot", "nobody"], "--robot is 'nobody'; expected a robot.yaml"),
         (["climb", "--scene", "no.yaml"], "no.yaml expected a readable file"),
         (["climb", "--scene", "a.yaml", "--height", "1"], "not both"),
+        (["replan"], "SEQUENCE"),
+        (["replan", "no.json"], "no.json expected a readable file"),
+        (["replan", "no", "--from", "3"], "no expected a run folder"),
+        (["climb", "--search.tries", "-1"], "--search.tries is -1; expected 0 or more"),
         (["scene", "no.yaml"], "no.yaml expected a readable file"),
         (["robot", "check", "nobody.urdf"], "expected a robot.yaml"),
         (["sweep", "no.yaml"], "no.yaml expected a readable file"),
@@ -761,3 +766,78 @@ def test_flags_of_a_picture_that_do_not_fit_are_one_sentence(
 )
 def test_sizes_by_their_lines_are_16_to_9(text: str, size: tuple[int, int]):
     assert cli._picture_size(text) == size
+
+
+# Learning.
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a policy, and the sequence that it was learned from."""
+    folder = tmp_path_factory.mktemp("learn")
+    sequence = clamber.detect_contacts(clamber.load_demo("crossing"))
+    clamber.save_sequence(sequence, folder / "sequence.json")
+    out = folder / "policy.json"
+    code = cli.main(
+        ["learn", str(folder / "sequence.json"), "--out", str(out), "--quiet"]
+    )
+    assert code == 0
+    return folder
+
+
+def test_learn_writes_a_policy_that_is_read_again_and_two_pictures(learned: Path):
+    policy = clamber.load_policy(learned / "policy.json")
+    assert [o.name for o in policy.options] == "ac1 ac2 ac3 ac2 ac1 ac4".split()
+    for name in ("policy.png", "policy-pelvis.png"):
+        content = (learned / name).read_bytes()
+        assert content.startswith(b"\x89PNG")
+        assert len(content) < 1_000_000
+    assert not [p for p in learned.iterdir() if p.name.startswith(".")]
+
+
+def test_learn_shows_options_and_the_pelvis(
+    learned: Path, capsys: pytest.CaptureFixture[str]
+):
+    arguments = ["learn", str(learned), "--out", str(learned / "shown.json")]
+    assert cli.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "LElbow, RElbow, LKnee, RKnee" in out
+    assert "near edge" in out
+    assert "over top" in out
+    assert str(learned / "shown.json") in out
+    assert cli.main([*arguments, "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert [o["region"] for o in record["options"]] == "M M O M M goal".split()
+    assert record["options"][2]["surfaces"] == ["LElbow", "RElbow", "LKnee", "RKnee"]
+    assert record["near_edge"]["samples"] > 10
+    assert len(record["over_top"]["sigma"]) == 3
+    assert record["secondary"] == []
+    assert record["out"] == str(learned / "shown.json")
+
+
+def test_learning_twice_writes_the_same_bytes(learned: Path):
+    other = learned / "again.json"
+    cli.main(["learn", str(learned), "--out", str(other), "--quiet"])
+    assert other.read_bytes() == (learned / "policy.json").read_bytes()
+    picture = learned / "again.png"
+    assert picture.read_bytes() == (learned / "policy.png").read_bytes()
+
+
+def test_what_cannot_be_learned_from_is_said_in_a_sentence(
+    learned: Path, capsys: pytest.CaptureFixture[str]
+):
+    broken = learned / "broken.json"
+    broken.write_text((learned / "sequence.json").read_text()[:5000])
+    for arguments, words in (
+        (["climb"], ["climb", "no repeated cycle"]),
+        (["crossin"], ["crossin", "expected"]),
+        ([str(broken)], ["broken.json", "whole JSON"]),
+        ([str(learned / "policy.json")], ["policy.json", "expected"]),
+        ([str(learned), "--out", str(learned / "policy.txt")], ["policy.txt", ".json"]),
+        ([], ["at least one demonstration"]),
+    ):
+        assert cli.main(["learn", *arguments, "--quiet"]) == cli.BAD_INPUT
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        for word in words:
+            assert word in error

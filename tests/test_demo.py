@@ -283,7 +283,10 @@ def test_a_unit_that_is_not_said_is_told_from_the_shank(write, unit, scale):
         ("", "8 vertices"),
         ("v 0 0 0\n", "8 vertices"),
         ("v 0 zero 0\n", "line 1"),
-        (box_obj([1, 1, 1], [0, 0, 0.5], 0.0).replace("0.5", "0.8", 1), "upright box"),
+        (
+            box_obj([1, 1, 1], [0, 0, 0.5], 0.0).replace("0.5", "0.8", 1),
+            "8 vertices of a box",
+        ),
     ],
 )
 def test_an_obj_of_no_boxes_is_refused(tmp_path, text, word):

@@ -56,6 +56,7 @@ def test_the_command_of_a_job_is_that_job(job: Job):
     assert climb.planning.speed == job.speed
     assert climb.execution.controller == job.controller
     assert climb.execution.disturb == job.disturb
+    assert (climb.contacts, climb.search.bounds()) == (job.contacts, job.search)
 
 
 def test_a_command_names_what_differs_and_no_more():
@@ -74,6 +75,7 @@ def test_flags_have_the_defaults_of_the_command():
     assert (climb.planning.method, climb.planning.speed) == (job.method, job.speed)
     assert climb.execution.controller == job.controller
     assert climb.execution.disturb == job.disturb
+    assert (climb.contacts, climb.search.bounds()) == (job.contacts, job.search)
 
 
 def test_flags_are_checked_one_by_one():
@@ -85,12 +87,15 @@ def test_flags_are_checked_one_by_one():
         ({"height": 0.3, "controller": "lqr"}, "controller is 'lqr'"),
         ({"height": 0.3, "scene": "s.yaml"}, "height or scene, one of them"),
         ({}, "height or scene, one of them"),
+        ({"height": 0.3, "search.tries": -1}, "search.tries is -1"),
+        ({"height": 0.3, "contacts": "none"}, "contacts is 'none'"),
     ):
         with pytest.raises(InputError) as wrong:
             job_of(flags)
         assert said in str(wrong.value)
     assert "disturb.friction" in FLAGS
-    assert "disturb" not in FLAGS
+    assert "search.depth" in FLAGS
+    assert not {"disturb", "search"} & set(FLAGS)
 
 
 def test_jobs_are_equal_by_value():

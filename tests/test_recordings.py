@@ -13,6 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import clamber
+from clamber.boxes import AXES, to_z_up
 from clamber.contact import ContactInterval
 from clamber.demo import (
     ClimbOptions,
@@ -25,7 +26,6 @@ from clamber.demo import (
     write_c3d,
     write_trc,
 )
-from clamber.demo.boxes import AXES, to_z_up
 from clamber.demo.bvh import read_bvh
 from clamber.demo.demonstration import estimate_offsets
 from clamber.demo.marker_sets import recognise

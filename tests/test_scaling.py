@@ -317,3 +317,13 @@ def test_surfaces_that_the_robot_lacks_are_left_out(world):
     assert robot.subject is None
     assert robot.scene is world.scene
     np.testing.assert_array_equal(robot.t, with_seat.t)
+
+
+def test_how_the_person_held_the_pelvis_is_not_carried_over(coman):
+    demo = climb()
+    pelvis = np.array([0.0, 0.0, 0.9, 1.0, 0.0, 0.0, 0.0])
+    posed = replace(
+        demo, stances=tuple(replace(s, pelvis=pelvis) for s in demo.stances)
+    )
+    there = retarget(posed, build_world(coman, Scene.from_height(0.3)))
+    assert all(s.pelvis is None for s in there.stances)

@@ -1,7 +1,11 @@
+from clamber.checkup import Checkup as Checkup
+from clamber.checkup import check_robot as check_robot
+from clamber.checkup import check_scene as check_scene
 from clamber.contact import Contact as Contact
 from clamber.contact import ContactInterval as ContactInterval
 from clamber.contact import ContactSequence as ContactSequence
 from clamber.contact import Stance as Stance
+from clamber.contraction import learn_policy as learn_policy
 from clamber.curves import save_curves as save_curves
 from clamber.demo import Demonstration as Demonstration
 from clamber.demo import load_demo as load_demo
@@ -20,10 +24,13 @@ from clamber.experiment import load_spec as load_spec
 from clamber.export import Exported as Exported
 from clamber.export import export_run as export_run
 from clamber.io import load_plan as load_plan
+from clamber.io import load_policy as load_policy
 from clamber.io import load_rollout as load_rollout
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
+from clamber.io import save_policy as save_policy
+from clamber.io import save_proposal as save_proposal
 from clamber.io import save_rollout as save_rollout
 from clamber.io import save_sequence as save_sequence
 from clamber.io import save_verdict as save_verdict
@@ -39,6 +46,13 @@ from clamber.model import load_robot as load_robot
 from clamber.pipeline import Plan as Plan
 from clamber.pipeline import PlanOptions as PlanOptions
 from clamber.pipeline import plan as plan
+from clamber.policy import DemoPolicy as DemoPolicy
+from clamber.policy import GeneralPolicy as GeneralPolicy
+from clamber.policy import Option as Option
+from clamber.policy import PelvisDistribution as PelvisDistribution
+from clamber.policy import pelvis_distribution as pelvis_distribution
+from clamber.proposal import Proposal as Proposal
+from clamber.proposal import propose_robot as propose_robot
 from clamber.report import Reported as Reported
 from clamber.report import write_report as write_report
 from clamber.scene import Box as Box
@@ -53,6 +67,20 @@ from clamber.simulation import simulate as simulate
 from clamber.sweep import load_sweep as load_sweep
 from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
+from clamber.viz import draw_robot as draw_robot
+from clamber.viz import draw_scene as draw_scene
 from clamber.viz import render_run as render_run
 
 __version__: str
+from clamber.alternatives import Alternative as Alternative
+from clamber.alternatives import Ranked as Ranked
+from clamber.alternatives import Replanned as Replanned
+from clamber.alternatives import contact_alternatives as contact_alternatives
+from clamber.alternatives import contact_differences as contact_differences
+from clamber.alternatives import midway_of as midway_of
+from clamber.alternatives import plan_cost as plan_cost
+from clamber.alternatives import plan_or_replan as plan_or_replan
+from clamber.alternatives import replan as replan
+from clamber.alternatives import replan_rest as replan_rest
+from clamber.exploration import Bounds as Bounds
+from clamber.pipeline import Midway as Midway

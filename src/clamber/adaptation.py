@@ -15,15 +15,16 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import InputError, Status
-from clamber.model import World, build_world
+from clamber.model import Kinematics, World, build_world
 from clamber.moves import Step, split_moves
-from clamber.path import ARC_WEIGHT, Phase, bridge
-from clamber.pipeline import Plan, search_steps
+from clamber.path import ARC_WEIGHT, Path, Phase, bridge
+from clamber.pipeline import Midway, Plan, PlanOptions, search_steps, timed
 from clamber.posture import direct
 from clamber.posture.ik import IK, ContactGoal, support_rotation
 from clamber.posture.keyframe import Keyframe, KeyframeTask, bearing_frames
 from clamber.scaling import retarget
-from clamber.scene import Scene
+from clamber.scene import GROUND, Scene
+from clamber.se3 import quat_from_matrix
 from clamber.search import standing
 from clamber.statics import com_margin, support_polygon
 from clamber.trajectory import HOLD_END, HOLD_START, RATE, Trajectory, build_trajectory
@@ -43,92 +44,109 @@ class Adapted:
         world: As it is believed to be.
         trajectory: None where there is no way, or nothing left to do.
         keyframes: The present stance first; one more for each step.
+        paths: Between them.
         missed: Why steps are missing; empty where none is.
     """
 
     world: World
     trajectory: Trajectory | None
     keyframes: tuple[Keyframe, ...]
+    paths: tuple[Path, ...] = ()
     missed: str
 
 
-def adapt_plan(
-    plan: Plan,
-    scene: Scene,
-    made: int,
-    contacts: Sequence[Contact],
-    loaded: Sequence[Contact],
-    q: np.ndarray,
-    commanded: np.ndarray,
-) -> Adapted:
+def felt_contact(kin: Kinematics, c: Contact) -> Contact:
+    """The contact where its surface is in the present posture, lying flat.
+
+    On the ground, which is known, it is exactly there.
+    """
+    support = kin.world.supports[c.support]
+    p = kin.contact_point(c.surface, support.normal, c.edge)
+    s = kin.world.surfaces[c.surface]
+    R = kin.rotation(s.body)
+    quaternion = c.quaternion
+    if s.rotation is not None:
+        flat = support_rotation(support, quat_from_matrix(R @ s.rotation))
+        quaternion = quat_from_matrix(flat)
+    if c.support == GROUND:
+        p = support.project(p)
+    return replace(
+        c, position=p, quaternion=quaternion, link=quat_from_matrix(R), edge=None
+    )
+
+
+def adapt_plan(plan: Plan, scene: Scene, now: Midway, commanded: np.ndarray) -> Adapted:
     """Take a stance as it is and plan the steps that are left.
 
     Args:
         plan: The first one.
         scene: As it is believed to be. Where there is no way at the distance that its
             roughness asks for, that is not kept.
-        made: Steps of the plan's sequence that have been made.
-        contacts: Where they are.
-        loaded: Those of them that bear load already.
-        q: (nq,) joint angles as commanded, the base as measured.
+        now: Where the robot is.
         commanded: (nq,) reference at present; the new one begins there.
     """
-    found = _adapt(plan, scene, made, contacts, loaded, q, commanded)
+    found = _adapt(plan, scene, now, commanded)
     if found.missed and any(b.roughness > 0 for b in scene.boxes):
         smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
-        scene = replace(scene, boxes=smooth)
-        other = _adapt(plan, scene, made, contacts, loaded, q, commanded)
+        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded)
         if not other.missed or len(other.keyframes) > len(found.keyframes):
             return other
     return found
 
 
-def _adapt(
-    plan: Plan,
-    scene: Scene,
-    made: int,
-    contacts: Sequence[Contact],
-    loaded: Sequence[Contact],
-    q: np.ndarray,
-    commanded: np.ndarray,
-) -> Adapted:
-    world = build_world(plan.world.robot, scene)
-    ik = IK(world)
-    stance, bearing = tuple(contacts), tuple(loaded)
+def _adapt(plan: Plan, scene: Scene, now: Midway, commanded: np.ndarray) -> Adapted:
+    ik = IK(build_world(plan.world.robot, scene))
+    settled = settle(ik, now, commanded, plan.options)
+    if isinstance(settled, str):
+        return Adapted(world=ik.world, trajectory=None, keyframes=(), missed=settled)
+    return _rest(plan, ik, now.made, *settled)
+
+
+def settle(
+    ik: IK, now: Midway, commanded: np.ndarray, options: PlanOptions
+) -> tuple[Keyframe, tuple[Phase, ...]] | str:
+    """The optimised posture of a stance as it is and the way there, or why not.
+
+    Args:
+        ik: Workspace, of the world as it is believed to be.
+        now: Where the robot is.
+        commanded: (nq,) reference at present; the way begins there.
+        options: Of the plan.
+    """
+    world = ik.world
     problem = balance_problem(
         world,
-        held=bearing,
-        closed=tuple(c for c in stance if c not in bearing),
-        q_reference=q,
+        held=now.loaded,
+        closed=tuple(c for c in now.contacts if c not in now.loaded),
+        q_reference=now.q,
         posture_weight=1.0,
         margin=0.005,
     )
     problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
-    now = ik.solve_hard(problem, q)
-    task = KeyframeTask(held=stance, new=(), q_reference=now.q)
-    key = direct.optimise(ik, task, now.q, plan.options.keyframe)
+    here = ik.solve_hard(problem, now.q)
+    task = KeyframeTask(held=now.contacts, new=(), q_reference=here.q)
+    key = direct.optimise(ik, task, here.q, options.keyframe)
     if key.status is not Status.SOLVED:
-        reason = f"no stable posture here: {key.status.value}"
-        return Adapted(world=world, trajectory=None, keyframes=(), missed=reason)
-    begin = now.q.copy()
+        return f"no stable posture here: {key.status.value}"
+    begin = here.q.copy()
     begin[world.qadr] = commanded[world.qadr]
     lead = (
         Phase(
             kind="shift",
-            q=np.array([begin, now.q]),
-            contacts=stance,
-            load_before=bearing,
-            load_after=bearing,
+            q=np.array([begin, here.q]),
+            contacts=now.contacts,
+            load_before=now.loaded,
+            load_after=now.loaded,
         ),
         Phase(
             kind="settle",
-            q=bridge(ik, now.q, key.q, stance, stance),
-            contacts=stance,
-            load_before=bearing,
-            load_after=stance,
+            q=bridge(ik, here.q, key.q, now.contacts, now.contacts),
+            contacts=now.contacts,
+            load_before=now.loaded,
+            load_after=now.contacts,
         ),
     )
-    return _rest(plan, ik, made, key, lead)
+    return key, lead
 
 
 def start_again(plan: Plan, scene: Scene) -> Adapted:
@@ -146,26 +164,20 @@ def _rest(
         sequence = retarget(plan.sequence, world)
     except InputError as e:
         return Adapted(world=world, trajectory=None, keyframes=(key,), missed=str(e))
-    steps = _from_here(split_moves(sequence, world)[0][made:], key, world)
+    steps = from_here(split_moves(sequence, world)[0][made:], key.stance, world)
     found, _ = search_steps(ik, steps, plan.options, start=key)
-    phases = [*lead, *(p for path in found.paths for p in path.phases)]
-    ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in found.paths])
-    trajectory = None
-    if phases:
-        trajectory = build_trajectory(
-            world, phases, speed=plan.options.speed, keyframe_after=ends.tolist()
-        )
     return Adapted(
         world=world,
-        trajectory=trajectory,
+        trajectory=timed(world, found.paths, plan.options.speed, lead),
         keyframes=found.keyframes,
+        paths=found.paths,
         missed=found.missed[0].reason if found.missed else "",
     )
 
 
-def _from_here(steps: list[Step], key: Keyframe, world: World) -> list[Step]:
+def from_here(steps: list[Step], stance: Sequence[Contact], world: World) -> list[Step]:
     """The steps, where each limb leaves the surface that it is really on."""
-    on = {world.robot.limb_of(c.surface).name: c.surface for c in key.stance}
+    on = {world.robot.limb_of(c.surface).name: c.surface for c in stance}
     out = []
     for step in steps:
         surface = on.pop(step.move.limb, None)

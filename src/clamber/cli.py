@@ -153,7 +153,7 @@ class WorldFlags:
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
     ] = None
-    """A scene.yaml."""
+    """A scene.yaml, or boxes as OBJ or MJCF."""
 
     def load(self) -> tuple[clamber.Robot, clamber.Scene]:
         """Robot and scene, the scene first checked as the cheaper one."""
@@ -187,6 +187,39 @@ class PlanningFlags:
         _default("pipeline", "PlanOptions", "speed")
     )
     """Largest joint speed; max: as fast as joints and contacts bear."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchFlags:
+    """How far to look for contacts that nobody demonstrated."""
+
+    tries: int = _default("exploration", "Bounds", "tries")
+    """Steps that are planned at most; 0: no search."""
+    depth: int = _default("exploration", "Bounds", "depth")
+    """Moves of a sequence at most."""
+    policy: Annotated[
+        Path | None,
+        tyro.conf.arg(help_behavior_hint="(default: the sequence's own)"),
+    ] = None
+    """policy.json whose demonstrations say which contacts are tried first."""
+
+    def read(self) -> dict[str, Any]:
+        """The arguments of the functions that search."""
+        return {"bounds": self._bounds(), "counts": self._counts()}
+
+    def _bounds(self) -> clamber.Bounds:
+        try:
+            return clamber.Bounds(tries=self.tries, depth=self.depth)
+        except InputError as e:
+            source = f"--{e.field}"
+            raise InputError(e.expected, source=source, value=e.value) from e
+
+    def _counts(self) -> Any:
+        from clamber.exploration import policy_counts
+
+        if self.policy is None:
+            return None
+        return policy_counts(clamber.load_policy(self.policy))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,11 +264,15 @@ class ClimbCommand:
     """The whole job: detect contacts, plan, simulate; all files in one run folder."""
 
     demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
-    """A recording, or the built-in demonstration (climb)."""
+    """A recording, or a built-in demonstration (climb, crossing)."""
     fit_floor: bool = False
     """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
+    contacts: Literal["any", "demonstrated"] = "any"
+    """any: other contacts where the demonstrated ones have no stable plan."""
+    search: SearchFlags = field(default_factory=SearchFlags)
+    """How far to look for contacts that nobody demonstrated."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: bool = False
     """Draw a video too, not pictures alone."""
@@ -246,6 +283,7 @@ class ClimbCommand:
     def run(self) -> int:
         """Recording to verdict."""
         robot, scene = self.world.load()
+        others = None if self.contacts == "demonstrated" else self.search.read()
         clock = Clock()
         with self.output.progress() as show:
             report = clock.watching(show)
@@ -256,7 +294,9 @@ class ClimbCommand:
             folder = clamber.new_run_folder(self.out, "climb")
             clamber.save_sequence(sequence, folder / "sequence.json")
             with self.world.blamed():
-                plan = _plan(sequence, robot, scene, self.planning, folder, report)
+                plan = _plan(
+                    sequence, robot, scene, self.planning, folder, report, others
+                )
             done = self.execution.simulate(plan, folder, report, None)
             missing = ""
             try:
@@ -344,6 +384,111 @@ class PlanCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplanCommand:
+    """Other contacts than the demonstrated ones, ranked, the best planned; or the rest.
+
+    With --from the rest of a run is planned from where the robot is.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE|RUN")]
+    """A sequence.json; with --from, the run folder whose plan was followed."""
+    begin: Annotated[
+        str | None,
+        tyro.conf.arg(
+            name="from",
+            metavar="STATE|SECONDS",
+            help_behavior_hint="(default: from standing)",
+        ),
+    ] = None
+    """Where the robot is: a state file, or a time of the run's rollout."""
+    world: Annotated[WorldFlags, Flat]
+    planning: Annotated[PlanningFlags, Flat]
+    search: SearchFlags = field(default_factory=SearchFlags)
+    """How far to look for contacts that nobody demonstrated."""
+    out: Place = None
+    """The run folder (runs/replan, then runs/replan-2 ...)."""
+    output: Printed
+
+    def run(self) -> int:
+        """Sequence to ranked plans, or run and state to the plan of the rest."""
+        return self._ranked() if self.begin is None else self._rest(self.begin)
+
+    def _ranked(self) -> int:
+        from clamber.alternatives import described
+        from clamber.io import save_replanned
+
+        sequence = clamber.load_sequence(self.source)
+        robot, scene = self.world.load()
+        others = self.search.read()
+        with self.output.progress() as report, self.world.blamed():
+            found = clamber.replan(
+                sequence,
+                robot,
+                scene,
+                options=clamber.PlanOptions(**asdict(self.planning)),
+                **others,
+                progress=report,
+            )
+            folder = clamber.new_run_folder(self.out, "replan")
+            clamber.save_sequence(sequence, folder / "sequence.json")
+            clamber.save_plan(found.best.plan, folder)
+            save_replanned(found, folder)
+        if self.output.json:  # these two fields and no other
+            sys.stdout.write(json.dumps(_replanned_record(found)) + "\n")
+            return REACHED if found.best.stable else MISSED
+        table = _table("surfaces", "stable", "cost [m]", "moves", "why not")
+        for r in found.ranked:
+            table.add_row(
+                ", ".join(r.surfaces) or "as demonstrated",
+                "yes" if r.stable else "no",
+                f"{r.cost:.3f}",
+                str(len(r.plan.paths)),
+                "" if r.stable else _outcome(r.plan),
+            )
+        note = "the best one is planned" if found.best.stable else described(found)
+        self.output.show({}, table, note=f"{note}; the files are in {folder}")
+        return REACHED if found.best.stable else MISSED
+
+    def _rest(self, begin: str) -> int:
+        from clamber.io import load_state
+
+        made = clamber.load_plan(self.source)
+        if self.world.scene is None and self.world.height is None:
+            scene = made.world.scene
+        else:
+            scene = _scene(self.world.height, self.world.scene)
+        others = self.search.read()
+        q, touching = load_state(made, self.source, begin)
+        with self.output.progress() as report, self.world.blamed():
+            report("replan", 0.0, "")
+            now = clamber.midway_of(made, scene, q, touching, source=begin)
+            plan = clamber.replan_rest(made, now, scene, **others, progress=report)
+            folder = clamber.new_run_folder(self.out, "replan")
+            clamber.save_sequence(plan.sequence, folder / "sequence.json")
+            clamber.save_plan(plan, folder)
+        record = {"out": str(folder), "made": now.made, **_plan_record(plan)}
+        on = ", ".join(f"{c.surface} on {c.support}" for c in now.contacts)
+        note = (
+            f"from {on}, {now.made} steps made: {_outcome(plan)}; the files are in"
+            f" {folder}"
+        )
+        tables = [_keyframes(record)] if plan.keyframes else []
+        self.output.show(record, *tables, *_skipped(plan), note=note)
+        return REACHED if plan.complete else MISSED
+
+
+def _replanned_record(found: clamber.Replanned) -> dict[str, Any]:
+    """Differences and plans, the best first."""
+    return {
+        "differences": [list(d) for d in found.differences],
+        "plans": [
+            {"surfaces": list(r.surfaces), "cost": r.cost, "stable": r.stable}
+            for r in found.ranked
+        ],
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
 class SimulateCommand:
     """Run a plan in physics: rollout.npz, verdict.json."""
 
@@ -364,6 +509,100 @@ class SimulateCommand:
             )
             _save_timings(self.run_folder, clock)
         return _conclude(self.output, self.run_folder, plan, done)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnCommand:
+    """Learn the general policy of demonstrations: policy.json and its pictures."""
+
+    demonstrations: Annotated[
+        tuple[str, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="RECORDING|SEQUENCE|NAME"),
+    ]
+    """Recordings, sequence.json files, or built-in demonstrations (crossing)."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE", help_behavior_hint="(default: runs/learn/policy.json)"
+        ),
+    ] = None
+    """The policy's file; pictures are written beside it."""
+    output: Printed
+
+    def run(self) -> int:
+        """Demonstrations to a policy."""
+        from clamber.io import POLICY, policy_summary
+        from clamber.policy_plots import save_pictures
+
+        if not self.demonstrations:
+            raise InputError("at least one demonstration, such as crossing")
+        if self.out is not None and self.out.suffix != ".json":
+            raise InputError(
+                "a file that ends in .json", source="--out", value=str(self.out)
+            )
+        with self.output.progress() as report:
+            sequences = []
+            for k, name in enumerate(self.demonstrations):
+                report("detect", k / len(self.demonstrations), name)
+                sequences.append(_sequence(name))
+            report("detect", 1.0, "")
+            policy = clamber.learn_policy(sequences)
+            folder = clamber.new_run_folder(self.out and self.out.parent, "learn")
+            file = self.out or folder / POLICY
+            clamber.save_policy(policy, file)
+            report("draw", 0.0, "")
+            pictures = save_pictures(policy, file)
+            report("draw", 1.0, "")
+        record = {
+            "out": str(file),
+            "pictures": [str(p) for p in pictures],
+            **policy_summary(policy),
+        }
+        tables, notes = [], [*policy.notes]
+        for k, one in enumerate((policy, *policy.secondary)):
+            tables += _policy_tables(one, f"secondary {k}" if k else "")
+            notes += one.notes if k else ()
+            if k:
+                notes.append(f"secondary {k}: {', '.join(one.sources)}")
+        note = "\n".join([*notes, f"the policy is in {file}"])
+        self.output.show(record, *tables, note=note)
+        return REACHED
+
+
+def _sequence(name: str) -> clamber.ContactSequence:
+    """The contact sequence of a file, or what is detected in a recording."""
+    path = Path(name)
+    if path.suffix == ".json" or path.is_dir():
+        return clamber.load_sequence(path)
+    return clamber.detect_contacts(clamber.load_demo(name))
+
+
+def _policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
+    """Options, and how the pelvis is held."""
+    options = _table(
+        " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
+        "until",
+    )  # fmt: skip
+    for o in policy.options:
+        options.add_row(
+            o.name, o.region, ", ".join(o.surfaces), str(o.repeats),
+            " ".join(o.initiation), o.termination,
+        )  # fmt: skip
+    pelvis = _table("pelvis", "angle", "mean [deg]", "sigma [deg]", "imposed [deg]")
+    for place, d in (("near edge", policy.near_edge), ("over top", policy.over_top)):
+        for k, angle in enumerate(("roll", "pitch", "yaw")):
+            imposed = d.imposed[k]
+            pelvis.add_row(
+                "" if k else f"{place} ({d.samples})",
+                angle,
+                f"{math.degrees(d.mean[k]):.1f}",
+                f"{math.degrees(d.sigma[k]):.1f}",
+                "-"
+                if imposed is None
+                else " to ".join(f"{math.degrees(x):.1f}" for x in imposed),
+            )
+    return [options, pelvis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -560,64 +799,121 @@ class ExportCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCommand:
-    """Check a scene file and say what is in it."""
+    """Check a scene, say what is in it and, with --out, draw it."""
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A scene.yaml."""
+    """A scene.yaml, or boxes as OBJ or MJCF."""
+    robot: str = "coman"
+    """Who stands at its start: a built-in robot by name, or a robot.yaml."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Where to write the picture scene.png."""
     output: Printed
 
     def run(self) -> int:
         """Scene file to a table of its supports."""
         scene = clamber.load_scene(self.file)
-        table = _table("support", "centre [m]", "slope [rad]", "friction")
+        table = _table("support", "centre [m]", "slope [deg]", "friction", "")
         supports = []
+        faults = clamber.check_scene(scene)
         for s in scene.supports:
             centre = [round(float(x), 6) for x in s.position]
-            slope = math.acos(min(1.0, float(s.normal[2])))
-            supports.append({"name": s.name, "centre": centre, "friction": s.friction})
+            slope = math.degrees(math.acos(min(1.0, float(s.normal[2]))))
+            fault = faults.get(s.name, "")
+            supports.append(
+                {
+                    "name": s.name,
+                    "centre": centre,
+                    "slope": round(slope, 4),
+                    "friction": s.friction,
+                    "fault": fault,
+                }
+            )
             text = " ".join(f"{x:.3f}" for x in centre)
-            table.add_row(s.name, text, f"{slope:.3f}", f"{s.friction:g}")
-        self.output.show({"supports": supports}, table)
-        return REACHED
+            table.add_row(s.name, text, f"{slope:.1f}", f"{s.friction:g}", fault)
+        record: dict[str, Any] = {"supports": supports, "picture": None}
+        note = ""
+        if self.out is not None:
+            robot = clamber.load_robot(self.robot)
+            folder = clamber.new_run_folder(self.out, "scene")
+            record["picture"] = note = str(
+                clamber.draw_scene(robot, scene, folder / "scene.png")
+            )
+        self.output.show(record, table, note=note)
+        return MISSED if faults else REACHED
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobotCommand:
-    """Check a robot: load it, stand it up and say what a planner sees of it."""
+    """Bring a robot: init proposes a robot.yaml, check says what is wrong with one."""
 
-    action: tyro.conf.Positional[Literal["check"]]
-    """What to do with it."""
+    action: tyro.conf.Positional[Literal["init", "check"]]
+    """init: from an MJCF or URDF. check: a robot.yaml."""
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """A built-in robot by name, or a robot.yaml."""
+    """init: an MJCF or URDF file. check: a robot.yaml, or a built-in robot by name."""
+    effort: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """init: effort limits the model lacks: YAML {joint: N m}, or another model."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: init: robots/NAME)"),
+    ] = None
+    """Where to write robot.yaml and robot.xml (init), and the picture robot.png."""
     output: Printed
 
     def run(self) -> int:
-        """Robot file to a table of its limbs."""
-        import numpy as np
-
-        robot = clamber.load_robot(self.model)
-        world = clamber.build_world(robot, clamber.Scene(start=np.zeros(3)))
-        kin = clamber.Kinematics(world)
-        kin.update(world.home)
-        table = _table("limb", "from", "to", "surfaces")
+        """Description to a proposal, or a robot file to what a planner sees of it."""
+        notes: list[str] = []
+        path, out = self.model, self.out
+        if self.action == "init":
+            proposal = clamber.propose_robot(self.model, effort_from=self.effort)
+            out = out or Path("robots") / proposal.name
+            if out.exists() and (not out.is_dir() or any(out.iterdir())):
+                raise InputError(
+                    "a new or empty folder", source="--out", value=str(out)
+                )
+            out = clamber.new_run_folder(out, "robot")
+            clamber.save_proposal(proposal, out)
+            path, notes = str(out / "robot.yaml"), list(proposal.notes)
+        robot = clamber.load_robot(path)
+        found = clamber.check_robot(robot)
+        table = _table("limb", "from", "over", "to", "surfaces", "length [m]")
         for limb in robot.limbs.values():
-            table.add_row(limb.name, limb.root, limb.end, ", ".join(limb.surfaces))
-        segments = {k: round(v, 4) for k, v in clamber.limb_lengths(kin).items()}
+            table.add_row(
+                limb.name,
+                limb.root,
+                limb.middle,
+                limb.end,
+                ", ".join(limb.surfaces),
+                f"{found.lengths[limb.name]:.3f}",
+            )
+        if out is not None:
+            try:
+                clamber.draw_robot(robot, out / "robot.png")
+            except ClamberError as e:  # the robot is checked all the same
+                notes.append(str(e))
         record = {
+            "out": None if out is None else str(out),
             "name": robot.name,
-            "mass": round(world.mass, 4),
-            "joints": len(world.joints),
+            "mass": round(found.mass, 4),
+            "joints": found.joints,
             "surfaces": list(robot.surfaces),
-            "segments": segments,
-            "com_height": round(float(kin.com[2]), 4),
+            "segments": found.segments,
+            "knee_height": found.knee_height,
+            "com_height": found.com_height,
+            "faults": list(found.faults),
+            "notes": notes,
         }
-        lengths = ", ".join(f"{k} {v:.3f} m" for k, v in segments.items())
-        note = (
-            f"{robot.name}: {world.mass:.2f} kg, {len(world.joints)} actuated joints, "
-            f"CoM {kin.com[2]:.3f} m high as it stands; {lengths}"
-        )
-        self.output.show(record, table, note=note)
-        return REACHED
+        lengths = ", ".join(f"{k} {v:.3f} m" for k, v in found.segments.items())
+        lines = [
+            *(f"note: {x}" for x in notes),
+            *(f"wrong: {x}" for x in found.faults),
+            f"{robot.name}: {found.mass:.2f} kg, {found.joints} actuated joints, CoM"
+            f" {found.com_height:.3f} m and knees {found.knee_height:.3f} m high as it"
+            f" stands; {lengths}",
+        ]
+        if out is not None:
+            lines.append(f"the files are in {out}: look at robot.png")
+        self.output.show(record, table, note="\n".join(lines))
+        return MISSED if found.faults else REACHED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -703,7 +999,9 @@ Command = (
     Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
     | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
     | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
+    | Annotated[ReplanCommand, tyro.conf.subcommand("replan")]
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[ReportCommand, tyro.conf.subcommand("report")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
@@ -720,10 +1018,20 @@ def _plan(
     flags: PlanningFlags,
     folder: Path,
     report: Report,
+    others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
-    """Plan and save."""
+    """Plan and save; `others`: how others are looked for where the shown ones fail."""
     options = clamber.PlanOptions(**asdict(flags))
-    result = clamber.plan(sequence, robot, scene, options=options, progress=report)
+    world = (sequence, robot, scene)
+    if others is None:
+        result = clamber.plan(*world, options=options, progress=report)
+    else:
+        result = clamber.plan_or_replan(
+            *world,
+            options=options,
+            **others,
+            progress=report,
+        )
     report("save", 0.0, "")
     clamber.save_plan(result, folder)
     report("save", 1.0, "")
@@ -813,6 +1121,7 @@ def _plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, An
         )
     return {
         "complete": plan.complete,
+        "instead": plan.instead,
         "keyframes": keyframes,
         "skipped": [{"stance": s.stance, "reason": s.reason} for s in plan.skipped],
     }
@@ -845,7 +1154,9 @@ def _keyframes(record: Mapping[str, Any]) -> Table:
 def _outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
-        return "planned to the last stance"
+        return "; ".join(filter(None, (plan.instead, "planned to the last stance")))
+    if plan.instead:
+        return f"the robot cannot do it: {plan.instead}"
     missed = [s.reason for s in plan.skipped if s.missed]
     why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
     return f"the robot cannot do it: {why}"
@@ -888,7 +1199,7 @@ def _conclude(
         **planned,
     }
     if reached:
-        note = "the robot made it"
+        note = "; ".join(filter(None, (plan.instead, "the robot made it")))
     elif not plan.complete:
         note = _outcome(plan)
     elif rollout is not None and rollout.stopped:

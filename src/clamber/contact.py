@@ -81,18 +81,28 @@ class Stance:
         contacts: No surface twice.
         posture: Unit directions (3,) in the world by name, from `DIRECTIONS`; may be
             empty where the demonstration does not say.
+        pelvis: (7,) the pelvis in the world: position [m] and orientation wxyz, of a
+            frame with y to the left hip and z along the trunk; None where the
+            demonstration does not say, and at the robot's scale.
     """
 
     contacts: tuple[Contact, ...]
     posture: Mapping[str, np.ndarray] = field(default_factory=dict)
+    pelvis: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Check that no surface appears twice and that the directions are known."""
+        """Check that no surface appears twice, the directions and the pelvis."""
         names = [c.surface for c in self.contacts]
         if len(set(names)) != len(names):
             raise ValueError(f"a surface appears twice in a stance: {names}")
         if unknown := set(self.posture) - set(DIRECTIONS):
             raise ValueError(f"unknown directions {sorted(unknown)}")
+        if self.pelvis is not None:
+            pelvis = np.array(self.pelvis, dtype=float)
+            if pelvis.shape != (7,) or not np.all(np.isfinite(pelvis)):
+                raise ValueError(f"pelvis {pelvis}, expected 7 finite numbers")
+            pelvis.setflags(write=False)
+            object.__setattr__(self, "pelvis", pelvis)
 
     @property
     def region(self) -> Region:

@@ -99,6 +99,7 @@ _SHANK_UP = (
 )
 _SEAT_SPEED = 1.5  # a seat may be that much faster than a hand: hips are never still
 _JOIN_DISTANCE = 0.03  # [m]
+_MOVED = 0.06  # [m] what rests so far away is another contact, lifted or slid
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -365,7 +366,12 @@ def _part_intervals(
             strict[row] = loose[row] & (speed < options.enter_speed)
             strict[row] &= (n.height > w.low) & (n.height < w.high)
         either = _join(tracks, part, _any(loose), options)
-        for i, j in _hysteresis(_any(strict), either, options.min_duration * demo.rate):
+        least = options.min_duration * demo.rate
+        whole = _hysteresis(_any(strict), either, least)
+        rests = [
+            s for i, j in whole for s in _places(tracks, points, strict, (i, j), least)
+        ]
+        for i, j in rests:
             some = round(options.smoothing * demo.rate)
             firsts, lasts = (
                 [p for p, ok in zip(points, _any(loose[:, m].T), strict=True) if ok]
@@ -382,6 +388,47 @@ def _part_intervals(
                 continue
             ends, t = _limb_ends(demo, part), np.array([t0, t1])
             yield _interval(tracks, part, part, support, i, j - 1, t, ends)
+
+
+def _places(
+    tracks: _Tracks,
+    points: list[str],
+    strict: np.ndarray,
+    whole: tuple[int, int],
+    least: float,
+) -> list[tuple[int, int]]:
+    """Ranges within [i, j) in each of which a part rests at one place.
+
+    A part that slides, or is lifted no more than a point may rise in contact, comes to
+    rest elsewhere without leaving its window. It has not moved where one of its points
+    has not (a hand rolls, a heel rises); so an ankle without toes says nothing.
+
+    Args:
+        tracks: Of the demonstration.
+        points: P, of the part.
+        strict: (P, T) where each is slow and within its window.
+        whole: i, j.
+        least: Shorter rests count for nothing [samples].
+    """
+    i, j = whole
+    if points == [points[0][0] + "Foot"]:
+        return [(i, j)]
+    still = [(a + i, b + i) for a, b in runs(_any(strict[:, i:j])) if b - a >= least]
+    out, first = [], i
+    for (a0, a1), (b0, b1) in pairwise(still):
+        moved = []
+        for row, point in enumerate(points):
+            p = tracks.at(point)
+            before, after = (
+                p[m][strict[row, m]] for m in (slice(a0, a1), slice(b0, b1))
+            )
+            if len(before) and len(after):
+                gap = np.median(after, axis=0) - np.median(before, axis=0)
+                moved.append(float(np.linalg.norm(gap)) > _MOVED)
+        if moved and all(moved):
+            out.append((first, a1))
+            first = b0
+    return [*out, (first, j)]
 
 
 def _apart(intervals: Iterable[ContactInterval]) -> list[ContactInterval]:
@@ -559,18 +606,52 @@ def _stances(
         held.append(now)
     times.append(cuts[-1])
     stances = tuple(
-        Stance(contacts=contacts, posture=_posture(tracks, a, b))
+        Stance(
+            contacts=contacts,
+            posture=_posture(tracks, a, b),
+            pelvis=_pelvis(tracks, a, b),
+        )
         for contacts, a, b in zip(held, times[:-1], times[1:], strict=True)
     )
     return np.array(times), stances
 
 
-def _posture(tracks: _Tracks, t0: float, t1: float) -> dict[str, np.ndarray]:
-    """Mean directions of the segments over the middle half of a stance."""
+def _middle(tracks: _Tracks, t0: float, t1: float) -> np.ndarray:
+    """(T,) the middle half of a stance, one sample at least."""
     quarter = (t1 - t0) / 4.0
     t = tracks.demo.t
     middle = (t >= t0 + quarter) & (t <= t1 - quarter)
     middle[np.argmin(np.abs(t - (t0 + t1) / 2.0))] = True
+    return middle
+
+
+def _pelvis(tracks: _Tracks, t0: float, t1: float) -> np.ndarray | None:
+    """Mean pose (7,) of the pelvis over the middle half of a stance, where seen.
+
+    Between the hips, y to the left one, z along the trunk as far as it is square to y:
+    markers on hips and shoulders tell no more.
+    """
+    names = ("LHip", "RHip", "LShoulder", "RShoulder")
+    ok = _middle(tracks, t0, t1) & tracks.valid(*names)
+    if not ok.any():
+        return None
+    hips, shoulders = (
+        [np.mean(tracks.at(n)[ok], axis=0) for n in pair]
+        for pair in (names[:2], names[2:])
+    )
+    y = hips[0] - hips[1]
+    y = y / np.linalg.norm(y)
+    position = np.mean(hips, axis=0)
+    z = np.mean(shoulders, axis=0) - position
+    z = z - y * (y @ z)
+    z = z / np.linalg.norm(z)
+    R = np.stack([np.cross(y, z), y, z], axis=1)
+    return np.concatenate([position, quat_from_matrix(R)])
+
+
+def _posture(tracks: _Tracks, t0: float, t1: float) -> dict[str, np.ndarray]:
+    """Mean directions of the segments over the middle half of a stance."""
+    middle = _middle(tracks, t0, t1)
     segments: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         "trunk": (("LHip", "RHip"), ("LShoulder", "RShoulder"))
     }

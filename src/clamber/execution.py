@@ -19,16 +19,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from clamber.adaptation import REACH, Adapted, adapt_plan, feeling, start_again
+from clamber.adaptation import (
+    REACH,
+    Adapted,
+    adapt_plan,
+    feeling,
+    felt_contact,
+    start_again,
+)
 from clamber.contact import Contact
 from clamber.control import JointLaw
 from clamber.model import PHYSICS_STEP, Kinematics, World
 from clamber.moves import split_moves
-from clamber.pipeline import Plan
-from clamber.posture.ik import support_rotation
+from clamber.pipeline import Midway, Plan
 from clamber.posture.keyframe import Keyframe
 from clamber.scene import GROUND, Scene
-from clamber.se3 import quat_from_matrix
 from clamber.sensing import Measurement
 from clamber.terrain import believed_scene
 from clamber.trajectory import HOLD_END, HOLD_START, Trajectory
@@ -124,7 +129,7 @@ class Execution:
         self._limbs = world.robot.limbs.values()
         self._ankles = _ankles(world)
         self._positioned = np.zeros(len(self._qadr))  # share of (4.32), by joint
-        self._made = 0  # steps of the sequence
+        self._made = 0 if plan.midway is None else plan.midway.made
         self._steps = split_moves(plan.sequence, plan.world)[0]
         self._felt: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
         self._scale = 1.0  # of the torques: mass as felt over mass as described
@@ -238,6 +243,9 @@ class Execution:
         if abs(ratio - 1.0) > MASS_CHANGE:
             self._note(f"weighs {100 * ratio:.0f} % of what its description says")
             self._scale = float(np.clip(ratio, 0.5, 2.0))
+        if self._plan.midway is not None:
+            yield from self._check_stance()
+            return
         q, ref = self._pose, self.reference
         yaw = _yaw(q[3:7]) - _yaw(ref[3:7])
         yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
@@ -370,15 +378,13 @@ class Execution:
         bearing = [c in loaded for c in contacts]
         felt = [self._as_felt(c) for c in contacts]
         self._remember(felt)
-        found = adapt_plan(
-            self._plan,
-            self._believed(),
-            self._made,
-            felt,
-            [c for c, bears in zip(felt, bearing, strict=True) if bears],
-            self._rebased(),
-            self.reference,
+        now = Midway(
+            made=self._made,
+            contacts=tuple(felt),
+            loaded=tuple(c for c, b in zip(felt, bearing, strict=True) if b),
+            q=self._rebased(),
         )
+        found = adapt_plan(self._plan, self._believed(), now, self.reference)
         yield from self._rest(THINKING)
         yield from self._follow(found, off)
 
@@ -491,19 +497,8 @@ class Execution:
 
     def _as_felt(self, c: Contact) -> Contact:
         """The contact where it is by the sensors."""
-        p = self._point(c)
-        s = self._world.surfaces[c.surface]
-        R = self._kin.rotation(s.body)
-        support = self._world.supports[c.support]
-        quaternion = c.quaternion
-        if s.rotation is not None:
-            flat = support_rotation(support, quat_from_matrix(R @ s.rotation))
-            quaternion = quat_from_matrix(flat)
-        if c.support == GROUND:
-            p = p - support.normal * support.height(p)
-        return replace(
-            c, position=p, quaternion=quaternion, link=quat_from_matrix(R), edge=None
-        )
+        self._kin.update(self._pose)
+        return felt_contact(self._kin, c)
 
     def _remember(self, contacts: Sequence[Contact]) -> None:
         """Where supports have been felt, one place for each contact made."""

@@ -18,7 +18,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import IO, Any, TypeVar, get_args, get_type_hints
@@ -29,14 +29,23 @@ import numpy as np
 import pydantic
 
 import clamber.model
-from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.alternatives import Replanned
+from clamber.contact import (
+    Contact,
+    ContactInterval,
+    ContactSequence,
+    Region,
+    Stance,
+)
 from clamber.errors import InputError, Status
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
-from clamber.pipeline import Plan, PlanOptions, Skipped
+from clamber.pipeline import Midway, Plan, PlanOptions, Skipped
+from clamber.policy import DemoPolicy, GeneralPolicy, Option, PelvisDistribution, Place
 from clamber.posture.ik import Residuals
 from clamber.posture.keyframe import ContactState, Keyframe, bearing_frames
-from clamber.scene import Box, Scene, input_error
+from clamber.proposal import Proposal, robot_yaml
+from clamber.scene import Box, Scene, input_error, read_yaml
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
 from clamber.statics import Phase, StaticEquilibrium
@@ -44,14 +53,17 @@ from clamber.trajectory import Trajectory
 
 VERSION = 1
 SEQUENCE = "sequence.json"
+POLICY = "policy.json"
 PLAN = "plan.json"
 TRAJECTORY = "trajectory.npz"
 SCENE = "scene.xml"
+ROBOT = "robot.yaml"
 ASSETS = "assets"
 TIMINGS = "timings.json"
 ROLLOUT = "rollout.npz"
 VERDICT = "verdict.json"
 EXECUTION = "execution.json"
+REPLANNED = "replan.json"
 PLANNED_SCENE = "planned.xml"  # where physics ran another world than was planned for
 PLANNED_TRAJECTORY = "planned.npz"  # where another one was followed in the end
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
@@ -63,6 +75,7 @@ _OF_AN_EARLIER_PLAN = (
     EXECUTION,
     PLANNED_SCENE,
     PLANNED_TRAJECTORY,
+    REPLANNED,
 )
 _NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped", "rests_on"}
 _UNREADABLE = (
@@ -79,6 +92,7 @@ _Record = TypeVar("_Record")
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Pose = tuple[float, float, float, float, float, float, float]
 
 
 # Folders and whole files.
@@ -358,11 +372,22 @@ def contact_fields(c: Contact) -> dict[str, Any]:
     }
 
 
-class _StanceFile(pydantic.BaseModel):
-    t0: float
-    t1: float
+class _StateOfFile(pydantic.BaseModel):
     contacts: list[_ContactFile]
     posture: dict[str, Vector] = {}
+    pelvis: Pose | None = None
+
+    def stance(self) -> Stance:
+        return Stance(
+            contacts=tuple(c.contact() for c in self.contacts),
+            posture={n: np.array(v) for n, v in self.posture.items()},
+            pelvis=None if self.pelvis is None else np.array(self.pelvis),
+        )
+
+
+class _StanceFile(_StateOfFile):
+    t0: float
+    t1: float
 
 
 class _IntervalFile(_ContactFile):
@@ -393,13 +418,7 @@ class _SequenceFile(pydantic.BaseModel):
                 source=self.source,
                 subject=self.subject,
                 scene=self.scene.scene(),
-                stances=tuple(
-                    Stance(
-                        contacts=tuple(c.contact() for c in s.contacts),
-                        posture={n: np.array(v) for n, v in s.posture.items()},
-                    )
-                    for s in self.stances
-                ),
+                stances=tuple(s.stance() for s in self.stances),
                 t=np.array([s.t0 for s in self.stances] + [self.stances[-1].t1]),
                 intervals=tuple(
                     ContactInterval(
@@ -418,6 +437,15 @@ class _SequenceFile(pydantic.BaseModel):
             ) from e
 
 
+def _stance_fields(stance: Stance) -> dict[str, Any]:
+    """Contacts and posture of a stance; its pelvis where it has one."""
+    out: dict[str, Any] = {
+        "contacts": [contact_fields(c) for c in stance.contacts],
+        "posture": stance.posture,
+    }
+    return out if stance.pelvis is None else out | {"pelvis": stance.pelvis}
+
+
 def sequence_fields(sequence: ContactSequence) -> dict[str, Any]:
     """A contact sequence by the keys of `sequence.json`."""
     return {
@@ -425,13 +453,8 @@ def sequence_fields(sequence: ContactSequence) -> dict[str, Any]:
         "subject": sequence.subject,
         "scene": scene_fields(sequence.scene),
         "stances": [
-            {
-                "region": s.region,
-                "t0": sequence.t[i],
-                "t1": sequence.t[i + 1],
-                "contacts": [contact_fields(c) for c in s.contacts],
-                "posture": s.posture,
-            }
+            {"region": s.region, "t0": sequence.t[i], "t1": sequence.t[i + 1]}
+            | _stance_fields(s)
             for i, s in enumerate(sequence.stances)
         ],
         "intervals": [
@@ -462,6 +485,143 @@ def load_sequence(path: str | Path) -> ContactSequence:
     if file.is_dir():
         file = file / SEQUENCE
     return _read_json(file, _SequenceFile).sequence(file)
+
+
+# Policies.
+
+
+class _OptionFile(pydantic.BaseModel):
+    name: str
+    region: Place
+    surfaces: tuple[str, ...]
+    repeats: int
+    initiation: tuple[Region, ...]
+    held: tuple[str, ...]
+    termination: Place
+
+
+class _PelvisFile(pydantic.BaseModel):
+    mean: Vector
+    sigma: tuple[float | None, float | None, float | None]
+    samples: int
+
+    def distribution(self) -> PelvisDistribution:
+        sigma = [math.inf if s is None else s for s in self.sigma]
+        return PelvisDistribution(
+            mean=np.array(self.mean), sigma=np.array(sigma), samples=self.samples
+        )
+
+
+class _DemoFile(pydantic.BaseModel):
+    source: str
+    scene: _SceneFile
+    subject: dict[str, float]
+    states: list[_StateOfFile]
+    actions: tuple[str | None, ...]
+
+    def demo(self) -> DemoPolicy:
+        return DemoPolicy(
+            source=self.source,
+            scene=self.scene.scene(),
+            subject=self.subject,
+            states=tuple(s.stance() for s in self.states),
+            actions=self.actions,
+        )
+
+
+class _GeneralFile(pydantic.BaseModel):
+    options: list[_OptionFile]
+    over_top: _PelvisFile
+    near_edge: _PelvisFile
+    goal: tuple[str, ...]
+    reach: dict[str, float]
+    demos: list[_DemoFile]
+    notes: tuple[str, ...] = ()
+    secondary: list[_GeneralFile] = []
+
+    def policy(self, path: Path, field: str) -> GeneralPolicy:
+        """The record; what does not fit is named by its field of the file."""
+
+        def made(where: str, make: Callable[[], _Record]) -> _Record:
+            try:
+                return make()
+            except (ValueError, KeyError) as e:
+                text = f"a policy that fits together ({e.args[0]})"
+                raise InputError(text, source=path, field=f"{field}{where}") from e
+
+        return made(
+            "options",
+            lambda: GeneralPolicy(
+                options=tuple(
+                    made(f"options.{i}", lambda o=o: Option(**o.model_dump()))
+                    for i, o in enumerate(self.options)
+                ),
+                over_top=made("over_top", self.over_top.distribution),
+                near_edge=made("near_edge", self.near_edge.distribution),
+                goal=self.goal,
+                reach=self.reach,
+                demos=tuple(
+                    made(f"demos.{i}", d.demo) for i, d in enumerate(self.demos)
+                ),
+                notes=self.notes,
+                secondary=tuple(
+                    s.policy(path, f"{field}secondary.{i}.")
+                    for i, s in enumerate(self.secondary)
+                ),
+            ),
+        )
+
+
+def policy_summary(policy: GeneralPolicy) -> dict[str, Any]:
+    """A general policy in plain numbers and words, without its demo policies."""
+    summary = {k: v for k, v in policy_fields(policy).items() if k != "demos"}
+    summary["sources"] = policy.sources
+    summary["secondary"] = [policy_summary(s) for s in policy.secondary]
+    return _plain(summary)
+
+
+def policy_fields(policy: GeneralPolicy) -> dict[str, Any]:
+    """A general policy by the keys of `policy.json`."""
+    return {
+        "options": [asdict(o) for o in policy.options],
+        "over_top": _pelvis_fields(policy.over_top),
+        "near_edge": _pelvis_fields(policy.near_edge),
+        "goal": policy.goal,
+        "reach": policy.reach,
+        "notes": policy.notes,
+        "demos": [
+            {
+                "source": d.source,
+                "scene": scene_fields(d.scene),
+                "subject": d.subject,
+                "states": [{"region": s.region} | _stance_fields(s) for s in d.states],
+                "actions": d.actions,
+            }
+            for d in policy.demos
+        ],
+        "secondary": [policy_fields(s) for s in policy.secondary],
+    }
+
+
+def _pelvis_fields(d: PelvisDistribution) -> dict[str, Any]:
+    return {"mean": d.mean, "sigma": d.sigma, "samples": d.samples}
+
+
+def save_policy(policy: GeneralPolicy, path: str | Path) -> None:
+    """Write `policy.json`: the general policy and the demo policies behind it."""
+    _write_json(Path(path), policy_fields(policy))
+
+
+def load_policy(path: str | Path) -> GeneralPolicy:
+    """Read a `policy.json`, or that of a folder.
+
+    Raises:
+        InputError: The file or one of its fields cannot be used.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / POLICY
+    return _read_json(file, _GeneralFile).policy(file, "")
 
 
 # Plans.
@@ -547,6 +707,22 @@ class _SkippedFile(pydantic.BaseModel):
     missed: bool = False
 
 
+class _MidwayFile(pydantic.BaseModel):
+    made: int = pydantic.Field(ge=0)
+    qpos: list[float]
+    contacts: list[_ContactFile]
+    loaded: list[str]
+
+    def midway(self) -> Midway:
+        contacts = tuple(c.contact() for c in self.contacts)
+        return Midway(
+            made=self.made,
+            contacts=contacts,
+            loaded=tuple(c for c in contacts if c.surface in self.loaded),
+            q=np.array(self.qpos),
+        )
+
+
 class _PlanFile(pydantic.BaseModel):
     options: dict[str, Any]
     robot: RobotFile
@@ -554,6 +730,8 @@ class _PlanFile(pydantic.BaseModel):
     keyframes: list[_KeyframeFile] = pydantic.Field(min_length=1)
     skipped: list[_SkippedFile]
     complete: bool
+    midway: _MidwayFile | None = None
+    instead: str = ""
 
 
 class _TimingsFile(pydantic.BaseModel):
@@ -606,7 +784,20 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "skipped": [asdict(s) for s in plan.skipped],
         "sequence": sequence_fields(plan.sequence)
         | {"scene": scene_fields(world.scene)},
-    }
+    } | _other_plan_fields(plan)
+
+
+def _other_plan_fields(plan: Plan) -> dict[str, Any]:
+    """What a plan has that is not of a whole climb as demonstrated."""
+    out: dict[str, Any] = {"instead": plan.instead} if plan.instead else {}
+    if plan.midway is not None:
+        out["midway"] = {
+            "made": plan.midway.made,
+            "qpos": plan.midway.q,
+            "contacts": [contact_fields(c) for c in plan.midway.contacts],
+            "loaded": [c.surface for c in plan.midway.loaded],
+        }
+    return out
 
 
 def _robot_fields(robot: Robot) -> dict[str, Any]:
@@ -629,6 +820,7 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
             for n, x in robot.limbs.items()
         },
         "surfaces": robot.prefixes,
+        "effort": robot.effort,
         "gains": {
             n: dict(zip(("kp", "kd", "ki"), g, strict=True))
             for n, g in robot.gains.items()
@@ -718,6 +910,16 @@ def _with_assets(world: World, folder: Path) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
+def save_proposal(proposal: Proposal, folder: str | Path) -> None:
+    """Write `robot.yaml` and the model that it names into a folder."""
+    for name, text in (
+        (proposal.fields["model"], proposal.mjcf),
+        (ROBOT, robot_yaml(proposal)),
+    ):
+        with _whole(Path(folder) / name) as stream:
+            stream.write(text.encode())
+
+
 def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     """Read what `save_plan` wrote, all but the paths.
 
@@ -744,6 +946,13 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     scene, followed = _planned(folder)
     world = _load_world(scene, _robot(file.robot), sequence.scene)
     nq = world.model.nq
+    if file.midway is not None and len(file.midway.qpos) != nq:
+        raise InputError(
+            f"{nq} numbers, as many as {SCENE} has coordinates",
+            source=path,
+            field="midway.qpos",
+            value=f"{len(file.midway.qpos)} numbers",
+        )
     for i, k in enumerate(file.keyframes):
         if len(k.qpos) != nq:
             raise InputError(
@@ -777,6 +986,8 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
         trajectory=trajectory,
         complete=file.complete,
         timings=timings,
+        midway=None if file.midway is None else file.midway.midway(),
+        instead=file.instead,
     )
 
 
@@ -807,6 +1018,7 @@ def _robot(file: RobotFile) -> Robot:
             if (x := file.limbs.get(n))
         },
         prefixes=file.surfaces,
+        effort=file.effort,
         gains={n: (g.kp, g.kd, g.ki) for n, g in file.gains.items()},
         impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
         self_positioning=tuple(file.self_positioning),
@@ -893,6 +1105,102 @@ def save_timings(folder: str | Path, seconds: Mapping[str, float]) -> None:
 
 def _sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+# Other contacts, and where a robot is.
+
+
+def save_replanned(found: Replanned, folder: str | Path) -> None:
+    """Write `replan.json`: what was tried, the best first, and what the search did."""
+    e = found.explored
+    _write_json(
+        Path(folder) / REPLANNED,
+        {
+            "differences": found.differences,
+            "plans": [
+                {
+                    "surfaces": r.surfaces,
+                    "cost": r.cost,
+                    "stable": r.stable,
+                    "moves": [str(p.transition.move) for p in r.plan.paths],
+                    "missed": [s.reason for s in r.plan.skipped if s.missed],
+                }
+                for r in found.ranked
+            ],
+            "search": None
+            if e is None
+            else {"states": e.states, "tries": e.tries, "stop": e.stop.value},
+        },
+    )
+
+
+class _StateOnDisk(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid")
+    version: int = VERSION
+    position: Vector
+    quaternion: Quaternion
+    joints: dict[str, float]
+    contacts: dict[str, str] | None = None
+
+
+def load_state(
+    plan: Plan, folder: str | Path, where: str
+) -> tuple[np.ndarray, dict[str, str] | None]:
+    """Posture (nq,) and the support of each surface in contact, None if not said.
+
+    Args:
+        plan: That the robot was following.
+        folder: Its run.
+        where: A state file (YAML or JSON: `position` and `quaternion` of the base,
+            `joints` by name, `contacts` as supports by surface), or a time of the run's
+            rollout [s].
+
+    Raises:
+        InputError: The file or one of its fields cannot be used, or nothing was
+            recorded at that time.
+    """
+    try:
+        seconds = float(where)
+    except ValueError:
+        return _state_of(plan.world, Path(where))
+    rollout = load_rollout(folder)
+    if not 0.0 <= seconds <= rollout.time[-1]:
+        raise InputError(
+            f"a time of the rollout, 0 to {rollout.time[-1]:g} s",
+            source="--from",
+            value=seconds,
+        )
+    return rollout.qpos[int(np.searchsorted(rollout.time, seconds))], None
+
+
+def _state_of(world: World, path: Path) -> tuple[np.ndarray, dict[str, str] | None]:
+    try:
+        state = _StateOnDisk.model_validate(read_yaml(path))
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    numbers = (*state.position, *state.quaternion, *state.joints.values())
+    if not np.all(np.isfinite(numbers)):
+        raise InputError("finite numbers only", source=path)
+    size = float(np.linalg.norm(state.quaternion))
+    if abs(size - 1.0) > 0.01:
+        raise InputError(
+            "a unit quaternion, w first",
+            source=path,
+            field="quaternion",
+            value=state.quaternion,
+        )
+    for name in (*state.joints, *world.joints):
+        if (name in state.joints) != (name in world.joints):
+            raise InputError(
+                f"the joints of {world.robot.name}: {', '.join(world.joints)}",
+                source=path,
+                field=f"joints.{name}",
+                value=state.joints.get(name, "missing"),
+            )
+    q = world.home.copy()
+    q[:3], q[3:7] = state.position, np.array(state.quaternion) / size
+    q[world.qadr] = [state.joints[n] for n in world.joints]
+    return q, state.contacts
 
 
 # Rollouts and verdicts.

@@ -15,18 +15,20 @@ from typing import Any, Literal
 
 import pydantic
 
+from clamber.alternatives import plan_or_replan
 from clamber.control import ControlMode
 from clamber.demo import load_demo
 from clamber.detect import detect_contacts
 from clamber.disturbance import Disturbance
 from clamber.errors import InputError
+from clamber.exploration import Bounds
 from clamber.model import PHYSICS_STEP, load_robot
 from clamber.pipeline import Method, Plan, PlanOptions, plan
 from clamber.scene import Scene, input_error, load_scene
 from clamber.simulation import DEFAULT_CONTROLLER, judge, simulate
 
 EFFORT = "largest effort, share of the limit"  # a criterion of the verdict
-DISTURB = "disturb."
+Contacts = Literal["any", "demonstrated"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +43,9 @@ class Job:
         method: How contact positions are optimised.
         speed: Largest joint speed [rad/s], or `max`.
         controller: `pid` or `mixed`.
+        contacts: `any`: others than the demonstrated ones where those have no stable
+            plan; or `demonstrated` only.
+        search: How far to search for other contacts.
         disturb: What the planner does not know.
     """
 
@@ -51,6 +56,8 @@ class Job:
     method: Method = field(default_factory=lambda: PlanOptions().method)
     speed: float | Literal["max"] = field(default_factory=lambda: PlanOptions().speed)
     controller: ControlMode = DEFAULT_CONTROLLER
+    contacts: Contacts = "any"
+    search: Bounds = field(default_factory=Bounds)
     disturb: Disturbance = field(default_factory=Disturbance)
 
     def __post_init__(self) -> None:
@@ -83,8 +90,9 @@ class Outcome:
 
 
 _JOB: pydantic.TypeAdapter[Job] = pydantic.TypeAdapter(Job)
-FLAGS = tuple(f.name for f in fields(Job) if f.name != "disturb") + tuple(
-    DISTURB + f.name for f in fields(Disturbance)
+GROUPS = {"search": Bounds, "disturb": Disturbance}  # flags such as `disturb.mass`
+FLAGS = tuple(f.name for f in fields(Job) if f.name not in GROUPS) + tuple(
+    f"{group}.{f.name}" for group, kind in GROUPS.items() for f in fields(kind)
 )
 
 
@@ -97,8 +105,10 @@ def job_of(flags: Mapping[str, Any]) -> Job:
     for name in flags:
         if name not in FLAGS:
             raise InputError(f"one of {', '.join(FLAGS)}", field="flag", value=name)
-    tree: dict[str, Any] = {k: v for k, v in flags.items() if "." not in k}
-    tree["disturb"] = {k.removeprefix(DISTURB): v for k, v in flags.items() if "." in k}
+    tree: dict[str, Any] = {g: {} for g in GROUPS}
+    for name, value in flags.items():
+        group, _, own = name.rpartition(".")
+        (tree[group] if group else tree)[own] = value
     try:
         return _JOB.validate_python(tree)
     except pydantic.ValidationError as e:
@@ -109,12 +119,13 @@ def command_of(job: Job) -> str:
     """The line that does the job again: robot, scene, controller, and what differs."""
     words = ["clamber", "climb"]
     for name in FLAGS:
-        home = job.disturb if name.startswith(DISTURB) else job
-        value = getattr(home, name.removeprefix(DISTURB))
+        group, _, own = name.rpartition(".")
+        home = getattr(job, group) if group else job
+        value = getattr(home, own)
         default = {
             f.name: f.default_factory() if callable(f.default_factory) else f.default
             for f in fields(home)
-        }[name.removeprefix(DISTURB)]
+        }[own]
         if value is None or (value == default and name not in ("robot", "controller")):
             continue
         text = repr(value) if isinstance(value, float) else str(value)
@@ -147,7 +158,14 @@ def run_job(job: Job) -> Outcome:
     """
     try:
         made = _planned(
-            job.demo, job.robot, job.height, job.scene, job.method, job.speed
+            job.demo,
+            job.robot,
+            job.height,
+            job.scene,
+            job.method,
+            job.speed,
+            job.contacts,
+            job.search,
         )
         if not made.complete or made.trajectory is None:
             missed = [s.reason for s in made.skipped if s.missed]
@@ -184,11 +202,12 @@ def _planned(
     scene: str | None,
     method: Method,
     speed: float | Literal["max"],
+    contacts: Contacts,
+    search: Bounds,
 ) -> Plan:
     """One process does many jobs that differ in their disturbances alone."""
-    return plan(
-        _detected(demo),
-        load_robot(robot),
-        scene_of(height, scene),
-        options=PlanOptions(method=method, speed=speed),
-    )
+    world = (_detected(demo), load_robot(robot), scene_of(height, scene))
+    options = PlanOptions(method=method, speed=speed)
+    if contacts == "demonstrated":
+        return plan(*world, options=options)
+    return plan_or_replan(*world, options=options, bounds=search)

@@ -15,12 +15,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
 import pydantic
 
+from clamber.description import Description, compile_description, read_description
 from clamber.errors import InputError
 from clamber.scene import GROUND, Scene, Support, input_error, read_yaml
 from clamber.se3 import matrix_from_quat, rotation_vector
@@ -72,6 +73,7 @@ class RobotFile(_Strict):
     home: dict[str, float] = {}
     limbs: dict[Literal["left_arm", "right_arm", "left_leg", "right_leg"], LimbFile]
     surfaces: dict[str, str] = {}
+    effort: dict[str, Annotated[float, pydantic.Field(gt=0)]] = {}
     gains: dict[str, GainsFile] = {"default": GainsFile()}
     impedance: dict[str, ImpedanceFile] = {}
     self_positioning: list[str] = []
@@ -103,6 +105,7 @@ class Robot:
         home: Joint angles of the posture it starts from [rad].
         limbs: By name, from `LIMBS`.
         prefixes: Prefix of the geom names of each surface.
+        effort: Largest torque [N m] of joints whose description has none, or another.
         gains: (kp, kd, ki) by joint name, and `default`.
         impedance: (kp, kd) of the joints that mixed control makes compliant (4.31).
         self_positioning: Joints that follow their terrain while the arms bear load
@@ -116,6 +119,7 @@ class Robot:
     limbs: Mapping[str, Limb]
     prefixes: Mapping[str, str]
     gains: Mapping[str, tuple[float, float, float]]
+    effort: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     impedance: Mapping[str, tuple[float, float]] = field(
         default_factory=lambda: MappingProxyType({})
     )
@@ -187,6 +191,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
         prefixes={
             s: file.surfaces.get(s, s) for limb in limbs.values() for s in limb.surfaces
         },
+        effort=dict(file.effort),
         gains={n: (g.kp, g.kd, g.ki) for n, g in gains.items()},
         impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
         self_positioning=tuple(file.self_positioning),
@@ -197,10 +202,8 @@ def load_robot(name_or_path: str | Path) -> Robot:
 
 def _check(robot: Robot, source: Path) -> None:
     """Compile the robot alone and look up every name that its file mentions."""
-    try:
-        model = mujoco.MjSpec.from_file(str(robot.path)).compile()
-    except ValueError as e:
-        raise InputError(f"a model that MuJoCo loads ({e})", source=robot.path) from e
+    description = read_description(robot.path)
+    model = compile_description(description, robot.path)
     bodies = {model.body(i).name for i in range(model.nbody)}
     geoms = {model.geom(i).name for i in range(model.ngeom)}
     joints = {model.joint(i).name for i in range(model.njnt)}
@@ -213,6 +216,8 @@ def _check(robot: Robot, source: Path) -> None:
         )
     named = {
         "home": robot.home,
+        "effort": robot.effort,
+        "gains": [n for n in robot.gains if n != "default"],
         "impedance": robot.impedance,
         "self_positioning": robot.self_positioning,
     }
@@ -225,6 +230,7 @@ def _check(robot: Robot, source: Path) -> None:
                     field=where,
                     value=name,
                 )
+    _check_joints(robot, model, description, source)
     for limb in robot.limbs.values():
         for place in ("root", "middle", "end"):
             if getattr(limb, place) not in bodies | geoms | set(robot.surfaces):
@@ -243,6 +249,46 @@ def _check(robot: Robot, source: Path) -> None:
                     field=f"limbs.{limb.name}.surfaces",
                     value=s,
                 )
+
+
+def _check_joints(
+    robot: Robot, model: mujoco.MjModel, description: Description, source: Path
+) -> None:
+    """Hinges with effort limits, each on its own, below one floating base."""
+    kinds = mujoco.mjtJoint
+    for j in range(model.njnt):
+        name, kind = model.joint(j).name, kinds(int(model.jnt_type[j]))
+        if kind == kinds.mjJNT_FREE:
+            owner = model.body(int(model.jnt_bodyid[j])).name
+            if owner != robot.base:
+                raise InputError(
+                    f"the body that floats, {owner}",
+                    source=source,
+                    field="base",
+                    value=robot.base,
+                )
+            continue
+        if kind != kinds.mjJNT_HINGE:
+            raise InputError(
+                "hinges alone; lock other joints by leaving them out",
+                source=robot.path,
+                field=f"joint {name!r}",
+                value=kind.name.removeprefix("mjJNT_").lower(),
+            )
+        if name in description.mimics:
+            raise InputError(
+                "joints that move on their own (it follows"
+                f" {description.mimics[name]!r}): leave it out",
+                source=robot.path,
+                field=f"joint {name!r}",
+            )
+        if name not in robot.effort and not np.any(model.jnt_actfrcrange[j]):
+            raise InputError(
+                "its largest torque [N m]: the description has none"
+                " (actuatorfrcrange, or a URDF's effort)",
+                source=source,
+                field=f"effort.{name}",
+            )
 
 
 def _bears(geom: str, prefix: str) -> bool:
@@ -353,7 +399,7 @@ def build_world(robot: Robot, scene: Scene) -> World:
     Actuators of the description are replaced by one joint servo per hinge, saturated at
     its effort limit. Supports have contact priority, so that their friction counts.
     """
-    spec = mujoco.MjSpec.from_file(str(robot.path))
+    spec = read_description(robot.path).spec
     _prepare_robot(spec, robot)
     spec.option.timestep = PHYSICS_STEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -396,6 +442,10 @@ def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
         a.trntype = mujoco.mjtTrn.mjTRN_JOINT
         a.set_to_position(kp=kp, kv=kd)
         limit = float(np.max(np.abs(j.actfrcrange)))
+        if j.name in robot.effort:
+            limit = robot.effort[j.name]
+            j.actfrcrange = [-limit, limit]
+            j.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
         a.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         a.forcerange = [-limit, limit]
 

@@ -20,6 +20,7 @@ from clamber.errors import Status
 from clamber.model import Kinematics, World
 from clamber.posture.ik import IK, ContactGoal, PostureProblem, support_rotation
 from clamber.posture.keyframe import contact_drift
+from clamber.scene import Support
 from clamber.transition import CLEARANCE, Transition, balance_problem
 
 SAFE_HEIGHT = 0.05  # [m] h_safe of (4.29)
@@ -95,6 +96,20 @@ def arc(
     c = _bulge(p1[2], p2[2], apex)
     out[:, 2] += 4.0 * c * s * (1.0 - s)
     return out
+
+
+def highest(support: Support, p1: np.ndarray, p2: np.ndarray) -> float:
+    """Height of a support's highest point below the way from `p1` to `p2` (3,) [m].
+
+    That of its origin where the way passes it by, or it is level.
+    """
+    n = support.normal
+    if n[2] >= 1.0:
+        return float(support.position[2])
+    way = p1 + np.linspace(0.0, 1.0, 4 * ARC_POINTS)[:, None] * (p2 - p1)
+    way[:, 2] -= support.height(way) / n[2]
+    over = way[support.inside(way), 2]
+    return float(over.max(initial=-np.inf)) if len(over) else float(support.position[2])
 
 
 def _bulge(z1: float, z2: float, apex: float) -> float:
@@ -192,7 +207,8 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
     slides = any(
         c.surface == made.surface and c.support == made.support for c in t.leaving
     )
-    control = arc(p1, made.position, support.position[2], slides, ARC_POINTS)
+    top = highest(support, p1, made.position)
+    control = arc(p1, made.position, top, slides, ARC_POINTS)
     shares = np.linspace(0.0, 1.0, len(control))
     rotation = support_rotation(support, made.quaternion)
 

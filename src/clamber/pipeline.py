@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from clamber.contact import ContactSequence
+from clamber.contact import Contact, ContactSequence
 from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
 from clamber.moves import Skipped, Step, split_moves
-from clamber.path import Path, overlap, watched_pairs
+from clamber.path import Path, Phase, overlap, watched_pairs
 from clamber.posture.ik import IK
 from clamber.posture.keyframe import Keyframe, KeyframeOptions
 from clamber.scaling import retarget
@@ -54,6 +54,29 @@ class PlanOptions:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Midway:
+    """Where a robot is in the middle of a climb.
+
+    Attributes:
+        made: Steps of the plan's sequence that have been made.
+        contacts: Its stance, each contact where it is.
+        loaded: Those of them that bear load already.
+        q: (nq,) its posture.
+    """
+
+    made: int
+    contacts: tuple[Contact, ...]
+    loaded: tuple[Contact, ...]
+    q: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Copy the posture and make it read-only."""
+        q = np.array(self.q, dtype=float)
+        q.setflags(write=False)
+        object.__setattr__(self, "q", q)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Plan:
     """Everything that planning found.
 
@@ -67,6 +90,10 @@ class Plan:
         trajectory: None where not even one move was found.
         complete: Every step that the demonstration asks for has a path.
         timings: Seconds by stage.
+        midway: Where it begins, where that is not the scene's start: the rest of a
+            climb, from its first keyframe, which is settled into.
+        instead: Why it makes other contacts than the demonstrated ones, and which;
+            empty where it does not.
     """
 
     world: World
@@ -78,6 +105,8 @@ class Plan:
     trajectory: Trajectory | None
     complete: bool
     timings: dict[str, float]
+    midway: Midway | None = None
+    instead: str = ""
 
 
 def plan(
@@ -109,15 +138,9 @@ def plan(
 
     steps, skipped = split_moves(goal, world)
     found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
-    trajectory = None
-    if found.paths:
-        report("trajectory", 1.0, "")
-        phases = [p for path in found.paths for p in path.phases]
-        ends = np.cumsum([len(path.phases) for path in found.paths]) - 1
-        trajectory = build_trajectory(
-            world, phases, speed=options.speed, keyframe_after=ends.tolist()
-        )
-        clock.lap("trajectory")
+    report("trajectory", 1.0, "")
+    trajectory = timed(world, found.paths, options.speed)
+    clock.lap("trajectory")
     return Plan(
         world=world,
         options=used,
@@ -169,6 +192,32 @@ def search_steps(
             break
     assert found is not None
     return found, used
+
+
+def timed(
+    world: World,
+    paths: Sequence[Path],
+    speed: float | Literal["max"],
+    lead: Sequence[Phase] = (),
+) -> Trajectory | None:
+    """The trajectory of `lead`, which leads to the first keyframe, and the paths.
+
+    Args:
+        world: Robot and scene.
+        paths: Between neighbouring keyframes.
+        speed: Largest joint speed [rad/s], or `max`.
+        lead: Phases before the first path.
+
+    Returns:
+        None where nothing moves.
+    """
+    phases = [*lead, *(p for path in paths for p in path.phases)]
+    if not phases:
+        return None
+    ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in paths])
+    return build_trajectory(
+        world, phases, speed=speed, keyframe_after=ends.astype(int).tolist()
+    )
 
 
 class _Clock:

@@ -75,7 +75,10 @@ def _ground_start(sequence: ContactSequence) -> np.ndarray:
 
 
 def _box_names(sequence: ContactSequence, world: World) -> dict[str, str]:
-    """Robot's box for each of the person's, in the order in which they are touched."""
+    """Robot's box for each of the person's, in the order in which they are touched.
+
+    A robot's own plan means the boxes that it names.
+    """
     touched = list(
         dict.fromkeys(
             c.support
@@ -85,6 +88,8 @@ def _box_names(sequence: ContactSequence, world: World) -> dict[str, str]:
         )
     )
     boxes = [b.name for b in world.scene.boxes]
+    if sequence.subject is None and set(touched) <= set(boxes):
+        return {name: name for name in touched}  # a robot's own plan
     if len(boxes) < len(touched):
         raise InputError(
             f"as many boxes as the demonstration touches ({len(touched)})",

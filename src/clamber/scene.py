@@ -7,6 +7,7 @@ normal; its convex polygon is given in that frame's x and y, counter-clockwise.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -16,10 +17,12 @@ import pydantic
 import yaml
 from numpy.typing import ArrayLike
 
+from clamber.boxes import NAME, read_drawn_boxes
 from clamber.errors import InputError
 from clamber.se3 import matrix_from_rpy
 
 GROUND = "ground"
+DRAWN = (".obj", ".xml")  # files of boxes
 GROUND_HALF_SIZE = 20.0  # [m] the ground is a support of this half width
 NEAR_FACE = 0.23  # [m] from the ankles' midpoint to the box of `Scene.from_height`
 MAX_LENGTH = 50.0  # [m] a larger box is a wrong unit
@@ -240,7 +243,7 @@ class GroundFile(_Strict):
 class BoxFile(_Strict):
     """One of `boxes` of a scene file."""
 
-    name: str = pydantic.Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    name: str = pydantic.Field(pattern=NAME)
     size: tuple[Length, Length, Length]
     position: tuple[Number, Number] | tuple[Number, Number, Number]
     rpy: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -249,24 +252,45 @@ class BoxFile(_Strict):
 
 
 class SceneFile(_Strict):
-    """A scene as a person writes it (`scene.yaml`)."""
+    """A scene as a person writes it (`scene.yaml`).
+
+    `boxes` may be the name of an OBJ or MJCF file beside it; `friction` is then that of
+    boxes which the file gives none.
+    """
 
     version: int = 1
     ground: GroundFile = GroundFile()
-    boxes: list[BoxFile] = []
+    boxes: list[BoxFile] | str = []
+    friction: Friction = 0.8
     start: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
     goal: tuple[Number, Number] | tuple[Number, Number, Number] | None = None
 
     @pydantic.field_validator("boxes")
     @classmethod
-    def _unique(cls, boxes: list[BoxFile]) -> list[BoxFile]:
+    def _unique(cls, boxes: list[BoxFile] | str) -> list[BoxFile] | str:
+        if isinstance(boxes, str):
+            return boxes
         names = [b.name for b in boxes] + [GROUND]
         if len(set(names)) != len(names):
             raise ValueError(f"expected different names, none of them {GROUND!r}")
         return boxes
 
-    def scene(self) -> Scene:
-        """The record."""
+    def scene(self, folder: Path = Path()) -> Scene:
+        """The record; files that it names are in `folder`.
+
+        Raises:
+            InputError: A file that it names cannot be used.
+        """
+        if isinstance(self.boxes, str):
+            boxes, friction = drawn_boxes(folder / self.boxes, self.friction)
+            if friction is None or "friction" in self.ground.model_fields_set:
+                friction = self.ground.friction
+            return Scene(
+                boxes=boxes,
+                ground_friction=friction,
+                start=np.array(self.start),
+                goal=None if self.goal is None else np.array(self.goal),
+            )
         boxes = []
         for b in self.boxes:
             bottom = b.position[2] if len(b.position) == 3 else 0.0
@@ -289,12 +313,53 @@ class SceneFile(_Strict):
         )
 
 
+def drawn_boxes(path: Path, friction: float) -> tuple[tuple[Box, ...], float | None]:
+    """Boxes of an OBJ or MJCF, and the friction of the ground where it has one.
+
+    Args:
+        path: The file.
+        friction: Of boxes of which it says none.
+
+    Raises:
+        InputError: It cannot be read, or a box of it cannot be used.
+    """
+    drawn, ground = read_drawn_boxes(path)
+    names = [b.name for b in drawn]
+    for b in drawn:
+        fault = None
+        if names.count(b.name) > 1 or b.name == GROUND or not re.match(NAME, b.name):
+            fault = f"a name of its own of letters, digits and _, not {GROUND!r}"
+        elif max(np.abs(b.size).max(), np.abs(b.position).max()) > MAX_LENGTH:
+            fault = f"metres, at most {MAX_LENGTH:g}: is it in millimetres?"
+        elif b.friction is not None and not 0 < b.friction <= 1:
+            fault = f"a friction above 0, at most 1, not {b.friction:g}"
+        if fault:
+            raise InputError(fault, source=path, field=f"box {b.name!r}")
+    boxes = tuple(
+        Box(
+            name=b.name,
+            size=b.size,
+            position=b.position,
+            rotation=b.rotation,
+            friction=friction if b.friction is None else b.friction,
+        )
+        for b in drawn
+    )
+    if ground is not None and not 0 < ground <= 1:
+        raise InputError(
+            "a friction above 0, at most 1", source=path, field="ground", value=ground
+        )
+    return boxes, ground
+
+
 def input_error(error: pydantic.ValidationError, source: object) -> InputError:
     """The first fault of a validation as one sentence with file, field and value."""
     first = error.errors()[0]
     # Where a field may be one of two shapes, pydantic adds the shape to the path.
     where = ".".join(
-        x for x in map(str, first["loc"]) if not x.startswith(("tuple[", "union["))
+        x
+        for x in map(str, first["loc"])
+        if not x.startswith(("tuple[", "union[", "list["))
     )
     text = first["msg"].removeprefix("Value error, ").removeprefix("expected ")
     text = text.removeprefix("Input should be ")
@@ -326,12 +391,15 @@ def read_yaml(path: Path) -> dict:
 
 
 def load_scene(path: str | Path) -> Scene:
-    """Read a `scene.yaml`.
+    """Read a `scene.yaml`, or the boxes of an OBJ or MJCF (`.xml`).
 
     Raises:
         InputError: The file or one of its fields cannot be used.
     """
+    path = Path(path)
     try:
-        return SceneFile.model_validate(read_yaml(Path(path))).scene()
+        if path.suffix.lower() in DRAWN:
+            return SceneFile(boxes=path.name).scene(path.parent)
+        return SceneFile.model_validate(read_yaml(path)).scene(path.parent)
     except pydantic.ValidationError as e:
         raise input_error(e, path) from e

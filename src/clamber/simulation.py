@@ -14,6 +14,7 @@ import numpy as np
 
 from clamber.control import ControlMode, driven_world
 from clamber.disturbance import Disturbance
+from clamber.errors import InputError
 from clamber.execution import Event, Execution, Tracking
 from clamber.model import PHYSICS_STEP, World
 from clamber.pipeline import Plan
@@ -128,10 +129,17 @@ def simulate(
 
     Raises:
         ValueError: The plan has no trajectory.
+        InputError: A start is disturbed that is not the scene's.
     """
     if plan.trajectory is None:
         raise ValueError("the plan has no trajectory")
     d = disturbance or Disturbance()
+    if plan.midway is not None and (d.x, d.y, d.yaw) != (0.0, 0.0, 0.0):
+        raise InputError(
+            "0: the plan begins in the middle of a climb, not at the scene's start",
+            field="disturb.x, y, yaw",
+            value=(d.x, d.y, d.yaw),
+        )
     world = driven_world(disturbed_world(plan.world, d, truth), controller)
     pilot = (Tracking if controller == "pid" else Execution)(plan, world)
     sensors = Sensors(
@@ -139,11 +147,14 @@ def simulate(
     )
     push = push_of(d, float(plan.trajectory.time[-1]))
     report = progress or (lambda stage, share, note: None)
-    return _run(world, pilot, sensors, push, len(plan.trajectory.time), report)
+    start = world.home if plan.midway is None else plan.midway.q
+    planned = len(plan.trajectory.time)
+    return _run(world, start, pilot, sensors, push, planned, report)
 
 
 def _run(
     world: World,
+    start: np.ndarray,
     pilot: Tracking | Execution,
     sensors: Sensors,
     push: np.ndarray | None,
@@ -152,7 +163,7 @@ def _run(
 ) -> Rollout:
     model = world.model
     data = mujoco.MjData(model)
-    data.qpos[:] = world.home
+    data.qpos[:] = start
     surfaces = tuple(world.surfaces)
     meter = _ContactMeter(world, surfaces)
     ctrl, qpos, qvel, effort, force, unintended = [], [], [], [], [], []
@@ -319,7 +330,9 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     up, up_planned = (_up(q[3:7]) for q in (last, planned))
     tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
     supports = rollout.world.supports
-    tops = [supports[c.support].position[2] for c in final if c.support in supports]
+    over = [
+        supports[c.support].height(last[:3]) for c in final if c.support in supports
+    ]
     order = [world.model.actuator(j).id for j in world.joints]
     share = np.abs(rollout.actuator_force[:, order]) / rollout.world.tau_max
     effort = float(share.max(initial=0.0))
@@ -347,7 +360,7 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
     if world.scene.goal is None:
         goal["share of the weight at the end on obstacles"] = _at_least(on_boxes, 0.98)
         goal["pelvis above its support at the end [m]"] = _at_least(
-            float(last[2] - max(tops, default=0.0)), 0.05
+            float(min(over, default=last[2])), 0.05
         )
     else:
         xy = world.scene.goal[:2]

@@ -59,13 +59,25 @@ def projected_distance(
     return float(np.linalg.norm(r - n * (r @ n)))
 
 
-def contact_angle(contact_point: ArrayLike, supported_point: ArrayLike) -> float:
+def contact_angle(
+    contact_point: ArrayLike,
+    supported_point: ArrayLike,
+    normal: ArrayLike = (0.0, 0.0, 1.0),
+) -> float:
     """Angle theta from the vertical to the line from a contact to its mass [rad].
 
     0 with the mass right above, pi where it hangs right below.
+
+    Args:
+        contact_point: (3,) the contact [m].
+        supported_point: (3,) shoulder or hip [m].
+        normal: (3,) unit vector to measure from in place of the vertical.
     """
-    x, y, z = np.subtract(supported_point, contact_point, dtype=float).tolist()
-    return math.atan2(math.hypot(x, y), z)
+    r = np.subtract(supported_point, contact_point, dtype=float)
+    n = np.asarray(normal, dtype=float)
+    along = float(r @ n)
+    x, y, z = (r - along * n).tolist()
+    return math.atan2(math.hypot(x, y, z), along)
 
 
 def theta_max(mu: float) -> float:

@@ -23,7 +23,7 @@ from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from clamber.contact import Contact
 from clamber.model import Kinematics, World
 from clamber.path import Phase
-from clamber.posture.keyframe import bearing_frames
+from clamber.posture.keyframe import bearing_frames, torque_limits
 from clamber.retiming import GRID, demand_at, least_torques, retime
 from clamber.se3 import quat_conjugate, quat_multiply
 from clamber.statics import com_margin, contact_forces, support_polygon
@@ -41,6 +41,7 @@ BALANCE_SAMPLES = 24  # of the centre of mass along a phase
 BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
 SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
 GRAVITY = 9.81  # [m/s^2]
+EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
 TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
 
@@ -105,15 +106,28 @@ def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
 def holding_torque(
     kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
 ) -> np.ndarray:
-    """(na,) joint torques that balance gravity with the least contact forces."""
+    """(na,) joint torques that balance gravity with the least contact forces.
+
+    Where these ask more of a joint than `EFFORT_SHARE` of its limit, those that do not:
+    a weak wrist leaves the load to the feet.
+    """
     w = kin.world
     kin.update(q)
-    tau = kin.gravity()
+    gravity = kin.gravity()
     names, points, normals, mu = bearing_frames(kin, contacts)
-    forces = contact_forces(points, normals, mu, kin.com.copy(), w.mass).forces
-    for name, p, f in zip(names, points, forces, strict=True):
-        tau = tau - kin.point_jacobian(w.surfaces[name].body, p).T @ f
-    return np.clip(tau[w.dadr], -w.tau_max, w.tau_max)
+    com = kin.com.copy()
+    limits = EFFORT_SHARE * w.tau_max
+    tau, torque = np.zeros(len(w.dadr)), None
+    for _ in range(2):
+        found = contact_forces(points, normals, mu, com, w.mass, torque=torque)
+        total = gravity
+        for name, p, f in zip(names, points, found.forces, strict=True):
+            total = total - kin.point_jacobian(w.surfaces[name].body, p).T @ f
+        tau = total[w.dadr]
+        if np.all(np.abs(tau) <= limits):
+            break
+        torque = torque_limits(kin, names, points, EFFORT_SHARE)
+    return np.clip(tau, -w.tau_max, w.tau_max)
 
 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from clamber.contact import Contact, ContactSequence
 from clamber.demo import Demonstration
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.io import ROLLOUT, load_plan, load_rollout, whole_file
-from clamber.model import Kinematics, Robot, World
+from clamber.model import Kinematics, Robot, World, build_world
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
 from clamber.scene import GROUND, Scene, Support
@@ -362,7 +362,69 @@ def near_edge_points(scene: Scene) -> np.ndarray:
     return np.concatenate([edge, edge * [1.0, 1.0, 0.0]])
 
 
+def draw_scene(
+    robot: Robot, scene: Scene, path: str | Path, *, tile: tuple[int, int] = (760, 560)
+) -> Path:
+    """Draw a scene with the robot at its start, its supports named, the goal marked."""
+    world = build_world(robot, scene)
+    kin = Kinematics(world)
+    kin.update(world.home)
+    tops = [s for s in scene.supports if s.name != GROUND]
+    seen = [robot_corners(kin)]
+    seen += [s.position + s.polygon @ s.rotation[:, :2].T for s in tops]
+    yaw, fovy = float(scene.start[2]), float(world.model.vis.global_.fovy)
+    view = frame_view(np.concatenate(seen), tile[0] / tile[1], yaw=yaw, fovy=fovy)
+    with Camera(world, tile) as camera:
+        picture = camera.shot(world.home, view)
+    draw = ImageDraw.Draw(picture)
+    for s in tops:
+        at, tip = view.project(
+            np.stack([s.position, s.position + 0.15 * s.normal]), tile
+        )
+        _arrow(draw, at, tip, DARK)
+        draw.text((at[0] + 8, at[1] + 4), s.name, font=_font(15), fill=DARK)
+    if scene.goal is not None:
+        at = tuple(view.project(np.array([*scene.goal[:2], 0.0]), tile))
+        _dot(draw, at, 6, PHASE_COLOURS["supporting"])
+        draw.text((at[0] + 8, at[1] - 8), "goal", font=_font(15), fill=DARK)
+    caption = f"{len(tops)} boxes, {robot.name} at the start"
+    return _save_sheet([(picture, [caption])], path, columns=1)
+
+
 # Sheets of pictures.
+
+
+def draw_robot(
+    robot: Robot, path: str | Path, *, tile: tuple[int, int] = (560, 640)
+) -> Path:
+    """Draw the robot as it stands, from behind and from ahead, its surfaces named.
+
+    A dot marks where each surface touches, a ring the mass that its limb supports.
+    """
+    world = build_world(robot, Scene(start=np.zeros(3)))
+    kin = Kinematics(world)
+    kin.update(world.home)
+    corners, up = robot_corners(kin), np.array([0.0, 0.0, 1.0])
+    fovy = float(world.model.vis.global_.fovy)
+    tiles = []
+    with Camera(world, tile) as camera:
+        for caption, turn in (("from behind", 0.0), ("from ahead", 2.4)):
+            view = frame_view(corners, tile[0] / tile[1], yaw=turn, fovy=fovy)
+            picture = camera.shot(world.home, view)
+            draw = ImageDraw.Draw(picture)
+            for limb in world.robot.limbs.values():
+                x, y = view.project(kin.landmark(limb.root)[1], tile)
+                draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline=DARK, width=2)
+                for surface, colour in zip(
+                    limb.surfaces, ((194, 65, 12), (29, 78, 216)), strict=False
+                ):
+                    at = tuple(view.project(kin.contact_point(surface, up), tile))
+                    _dot(draw, at, 5, colour)
+                    draw.text(
+                        (at[0] + 8, at[1] - 8), surface, font=_font(15), fill=DARK
+                    )
+            tiles.append((picture, [f"{world.robot.name}, {caption}"]))
+    return _save_sheet(tiles, path, columns=2)
 
 
 def keyframe_sheet(

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from clamber.demo.c3d import write_c3d
+from clamber.demo.crossing import CrossingOptions, synthesize_crossing
 from clamber.demo.demonstration import (
     PARTS,
     Demonstration,
@@ -29,6 +30,7 @@ __all__ = [
     "BUILT_IN",
     "PARTS",
     "ClimbOptions",
+    "CrossingOptions",
     "Demonstration",
     "Gap",
     "Level",
@@ -39,12 +41,13 @@ __all__ = [
     "load_demo",
     "read_points",
     "synthesize_climb",
+    "synthesize_crossing",
     "write_c3d",
     "write_trc",
 ]
 
-BUILT_IN = ("climb",)
-_SEED = 20  # of the built-in demonstration: the same one everywhere, always
+BUILT_IN = {"climb": synthesize_climb, "crossing": synthesize_crossing}
+_SEED = 20  # of the built-in demonstrations: the same ones everywhere, always
 
 
 def load_demo(
@@ -56,12 +59,12 @@ def load_demo(
     span: tuple[float, float] | None = None,
     fit_floor: bool = False,
 ) -> Demonstration:
-    """Read a recording, or take the built-in one by its name.
+    """Read a recording, or take a built-in one by its name.
 
     Args:
-        path_or_name: `climb` for the built-in synthetic one, a `recording.yaml`, or a
-            recording: C3D, TRC, BVH, Motive's CSV, or an array (`.npy`, or `.npz` with
-            `positions`, `names` and `rate`).
+        path_or_name: `climb` or `crossing` for a built-in synthetic one, a
+            `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, or an array
+            (`.npy`, or `.npz` with `positions`, `names` and `rate`).
         scene: Replaces the boxes of the recording, in its coordinates.
         names: Of the columns of a bare array: a list, or a JSON file with one.
         rate: Of a bare array, or in place of the file's own [Hz].
@@ -73,7 +76,7 @@ def load_demo(
         InputError: The name is unknown, or the file or a field cannot be used.
     """
     if str(path_or_name) in BUILT_IN:
-        demo, _ = synthesize_climb(np.random.default_rng(_SEED))
+        demo, _ = BUILT_IN[str(path_or_name)](np.random.default_rng(_SEED))
         return fit_levels(demo) if fit_floor else demo
     path = Path(path_or_name)
     if path.suffix.lower() not in SUFFIXES and not path.is_file():

@@ -16,8 +16,9 @@ from typing import Annotated, Literal
 import numpy as np
 import pydantic
 
+from clamber.boxes import to_z_up
 from clamber.demo import arrays, bvh, c3d, motive, trc
-from clamber.demo.boxes import FLOOR, lower_to_ground, read_obj_boxes, to_z_up
+from clamber.demo.boxes import FLOOR, lower_to_ground, read_obj_boxes
 from clamber.demo.demonstration import (
     MAX_GAP,
     SIDES,

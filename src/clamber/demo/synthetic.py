@@ -12,7 +12,7 @@ World: origin between the ankles, x towards the box, z up. Shapes: T samples.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,25 +22,44 @@ from clamber.demo.demonstration import (
     Demonstration,
     build_demonstration,
 )
+from clamber.demo.figure import (
+    ANKLE,
+    ELBOW,
+    FOOT,
+    FOREARM,
+    KNEE,
+    KNEE_HEIGHT,
+    REACH,
+    SHANK,
+    SIGN,
+    THIGH,
+    TOE,
+    TRUNK,
+    UPPER_ARM,
+    WRIST,
+    Held,
+    Tracks,
+    bend,
+    blend,
+    corrupt,
+    ease,
+    hit,
+    hop,
+    joint_of,
+    kick,
+    mirror_contact,
+    mirror_tracks,
+    reach,
+    rotate,
+    settle,
+    sway,
+    toe_pivot,
+    unit,
+)
 from clamber.scene import GROUND, Box, Scene
 from clamber.se3 import frame_from_normal, quat_from_matrix
 
-Tracks = dict[str, np.ndarray]
-
-THIGH, SHANK, UPPER_ARM, FOREARM = 0.373, 0.453, 0.311, 0.254  # [m]
-HIP, SHOULDER = 0.0975, 0.155  # [m] half widths
-TRUNK = 0.527  # [m] from the hips' middle to the shoulders'
-ANKLE, TOE, FOOT = (
-    0.08,
-    0.035,
-    0.15,
-)  # [m] heights standing; ankle to toe along the sole
-KNEE_HEIGHT = ANKLE + SHANK
-# Heights [m] of a joint's centre over what its part rests on.
-WRIST, ELBOW, KNEE = 0.03, 0.05, 0.11
 BOX_LENGTH, BOX_WIDTH = 1.7, 0.9  # [m] across and along the climb, a table
-REACH = 0.985  # of a limb's length: no one locks a loaded joint
-_SIGN = {"L": 1.0, "R": -1.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,16 +138,13 @@ def synthesize_climb(
         The recording and its true contacts by start time.
     """
     options = options or ClimbOptions()
-    t, tracks, truth = _clean_motion(rng, options)
+    tracks, truth = _clean_motion(rng, options)
     if options.mirrored:
-        tracks, truth = _mirror_tracks(tracks), [_mirror_contact(i) for i in truth]
+        tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
     names = tuple(tracks)
-    raw = np.stack([tracks[n] for n in names], axis=1)
-    raw += options.noise * rng.standard_normal(raw.shape)
-    for _ in range(options.gaps):
-        start = int(rng.integers(1, len(t) - 30))
-        length = int(rng.integers(4, 20) * options.rate / 120.0)
-        raw[start : start + length, int(rng.integers(len(names)))] = np.nan
+    raw = corrupt(
+        tracks, rng, noise=options.noise, gaps=options.gaps, rate=options.rate
+    )
     demo = build_demonstration(
         raw,
         names=names,
@@ -168,7 +184,7 @@ def _holds(o: ClimbOptions) -> _Holds:
     across = o.elbow_side - o.hand[1]
     along = np.sqrt(FOREARM**2 - across**2 - (ELBOW - WRIST) ** 2)
     holds = _Holds({}, {}, {}, {}, {})
-    for s, sign in _SIGN.items():
+    for s, sign in SIGN.items():
         holds.wrist[s] = np.array([edge + o.hand[0], sign * o.hand[1], h + WRIST])
         holds.elbow[s] = np.array(
             [edge + o.hand[0] - along, sign * o.elbow_side, h + ELBOW]
@@ -185,82 +201,12 @@ def _holds(o: ClimbOptions) -> _Holds:
 # The body: pelvis and chest, (3,) position and (3,) rotation vector each.
 
 
-@dataclass(frozen=True, slots=True)
-class _Held:
-    """What keeps the body where it is: points and the limb's length to them.
-
-    `exact` are distances from a hip or shoulder; `within` are upper bounds.
-    """
-
-    exact: tuple[tuple[str, np.ndarray, float], ...] = ()
-    within: tuple[tuple[str, np.ndarray, float], ...] = ()
-
-
-_JOINTS = {
-    "LHip": (0, np.array([0.0, HIP, 0.0])),
-    "RHip": (0, np.array([0.0, -HIP, 0.0])),
-    "LShoulder": (6, np.array([0.0, SHOULDER, 0.0])),
-    "RShoulder": (6, np.array([0.0, -SHOULDER, 0.0])),
-}
-
-
-def _rotate(rotvec: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) turned by rotation vectors (..., 3), Rodrigues' formula."""
-    angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
-    axis = rotvec / np.maximum(angle, 1e-12)
-    v = np.broadcast_to(v, rotvec.shape)
-    along = np.sum(axis * v, axis=-1, keepdims=True) * axis
-    return along + np.cos(angle) * (v - along) + np.sin(angle) * np.cross(axis, v)
-
-
-def _joint(body: np.ndarray, name: str) -> np.ndarray:
-    """(..., 3) position of a hip or shoulder of bodies (..., 12)."""
-    k, offset = _JOINTS[name]
-    return body[..., k : k + 3] + _rotate(body[..., k + 3 : k + 6], offset)
-
-
-def _settle(wanted: np.ndarray, held: _Held, *, trunk: bool) -> np.ndarray:
-    """Bodies (T, 12) nearest to `wanted` that keep what is held.
-
-    Gauss-Newton on the weighted squares of deviation, trunk length (where asked for)
-    and, a thousand times heavier, distances. What satisfies them comes back unchanged.
-    """
-    soft = np.array([3.0] * 3 + [1.0] * 3 + [3.0] * 3 + [1.0] * 3)
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        chord = np.linalg.norm(x[:, 6:9] - x[:, 0:3], axis=1)
-        rows = [soft * (x - wanted)]
-        if trunk:
-            bent = np.clip(chord, 0.9 * TRUNK, TRUNK)  # a rounded back is shorter
-            rows.append(8.0 * (chord - bent)[:, None])
-        for name, point, length in held.exact:
-            d = np.linalg.norm(_joint(x, name) - point, axis=1) - length
-            rows.append(1e3 * d[:, None])
-        for name, point, length in held.within:
-            d = np.linalg.norm(_joint(x, name) - point, axis=1) - length
-            rows.append(1e3 * np.maximum(d, 0.0)[:, None])
-        return np.concatenate(rows, axis=1)
-
-    x = wanted.copy()
-    step = 1e-6 * np.eye(12)
-    for _ in range(20):
-        r = residual(x)
-        J = np.stack([(residual(x + e) - r) / 1e-6 for e in step], axis=2)
-        H = J.transpose(0, 2, 1) @ J
-        g = np.einsum("tri,tr->ti", J, r)
-        change = np.linalg.solve(H, g[:, :, None])[:, :, 0]
-        x = x - change
-        if np.abs(change).max() < 1e-10:
-            break
-    return x
-
-
 def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
     """(K, 12) bodies as one would like them at the key poses.
 
     Depths are from the ankles, heights relative to the box as far as legs allow.
     """
-    h, sign = o.height, _SIGN[first]
+    h, sign = o.height, SIGN[first]
     x = o.edge
     wrist = x + o.hand[0]
     tall = ANKLE + SHANK + THIGH
@@ -310,79 +256,13 @@ _FOOT_PITCH = {  # [rad] heels rise: (first side, second side) at the key poses
 }
 
 
-def _ease(tau: np.ndarray) -> np.ndarray:
-    """Minimum-jerk profile from 0 to 1."""
-    tau = np.clip(tau, 0.0, 1.0)
-    return tau**3 * (10.0 - 15.0 * tau + 6.0 * tau**2)
-
-
-def _hit(tau: np.ndarray, slope: float = 1.4) -> np.ndarray:
-    """From rest at 0 to 1 that still moves on arrival: the support stops it."""
-    tau = np.clip(tau, 0.0, 1.0)
-    return (3.0 - slope) * tau**2 + (slope - 2.0) * tau**3
-
-
-def _hop(tau: np.ndarray) -> np.ndarray:
-    """A bump of height 1: off within a few per cent of the time, down with speed."""
-    tau = np.clip(tau, 0.0, 1.0)
-    return 4.0 * tau * (1.0 - tau) * (1.0 - np.exp(-tau / 0.03))
-
-
-def _kick(tau: np.ndarray) -> np.ndarray:
-    """From 0, fast within a few per cent of the time, to rest at 1."""
-    tau = np.clip(tau, 0.0, 1.0)
-    return tau * (2.0 - tau) * (1.0 - np.exp(-tau / 0.03))
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
-
-def _blend(a: np.ndarray, b: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Unit vectors (T, 3) on the great circle from a to b."""
-    a, b = np.broadcast_arrays(_unit(a), _unit(b))
-    angle = np.arccos(np.clip(np.sum(a * b, axis=-1, keepdims=True), -1.0, 1.0))
-    w = np.asarray(w)[..., None]
-    wide = np.maximum(np.sin(angle), 1e-9)
-    arc = (np.sin((1 - w) * angle) * a + np.sin(w * angle) * b) / wide
-    return _unit(np.where(angle < 1e-6, a, arc))
-
-
-def _bend(
-    root: np.ndarray, end: np.ndarray, upper: float, lower: float, pole: np.ndarray
-) -> np.ndarray:
-    """Middle joint (T, 3) of a two-bone limb, bent towards `pole`."""
-    line = end - root
-    d = np.linalg.norm(line, axis=-1, keepdims=True)
-    u = line / d
-    along = (d**2 + upper**2 - lower**2) / (2.0 * d)
-    out = np.sqrt(np.maximum(upper**2 - along**2, 0.0))
-    side = _unit(pole - u * np.sum(u * pole, axis=-1, keepdims=True))
-    return root + along * u + out * side
-
-
-def _reach(root: np.ndarray, end: np.ndarray, length: float) -> np.ndarray:
-    """The end (T, 3) drawn in to within a limb's reach."""
-    line = end - root
-    d = np.linalg.norm(line, axis=-1, keepdims=True)
-    return root + line * np.minimum(1.0, length / d)
-
-
-def _toe_pivot(toe: np.ndarray, ankle: np.ndarray, pitch: np.ndarray) -> np.ndarray:
-    """Ankle (T, 3) of a foot that has rolled by `pitch` (T,) about its toe."""
-    back = ankle - toe
-    left = np.array([-back[1], back[0], 0.0])
-    left = -left / np.linalg.norm(left)
-    return toe + _rotate(pitch[..., None] * left, back)
-
-
 def _held_from(
     key: int,
     o: ClimbOptions,
     first: str,
     pitch: Mapping[str, np.ndarray],
     leaving: bool,
-) -> _Held:
+) -> Held:
     """What is held on to from a key pose on.
 
     Args:
@@ -404,10 +284,10 @@ def _held_from(
         if key >= _KEY[f"{order} knee"]:
             exact.append((f"{s}Hip", holds.knee[s], THIGH))
         elif key < off or (key == off and leaving):
-            ankle = _toe_pivot(holds.toe[s], holds.ankle[s], pitch[s])
+            ankle = toe_pivot(holds.toe[s], holds.ankle[s], pitch[s])
             reach = REACH if key >= _KEY["first hand"] else 0.9995
             within.append((f"{s}Hip", ankle, reach * (THIGH + SHANK)))
-    return _Held(exact=tuple(exact), within=tuple(within))
+    return Held(exact=tuple(exact), within=tuple(within))
 
 
 def _orders(first: str) -> tuple[tuple[str, str], ...]:
@@ -416,8 +296,8 @@ def _orders(first: str) -> tuple[tuple[str, str], ...]:
 
 def _clean_motion(
     rng: np.random.Generator, o: ClimbOptions
-) -> tuple[np.ndarray, Tracks, list[ContactInterval]]:
-    """Times (T,), exact tracks (T, 3) and true contacts; the left side goes first."""
+) -> tuple[Tracks, list[ContactInterval]]:
+    """Exact tracks (T, 3) and true contacts; the left side goes first."""
     first = "L"
     at = np.array([when for _, when in _KEYS]) / o.speed
     t = np.arange(int(at[-1] * o.rate) + 1) / o.rate
@@ -430,7 +310,7 @@ def _clean_motion(
         for (s, _), angle in zip(_orders(first), angles, strict=True):
             key_pitch[s][_KEY[name]] = tall * angle
     pitch = {
-        s: k[phase] + (k[phase + 1] - k[phase]) * _ease(tau)
+        s: k[phase] + (k[phase + 1] - k[phase]) * ease(tau)
         for s, k in key_pitch.items()
     }
 
@@ -438,36 +318,26 @@ def _clean_motion(
     for k in range(len(at)):
         now = {s: x[k : k + 1] for s, x in key_pitch.items()}
         held = _held_from(k, o, first, now, leaving=True)
-        keys[k] = _settle(keys[k : k + 1], held, trunk=True)[0]
+        keys[k] = settle(keys[k : k + 1], held, trunk=True)[0]
     drops = np.isin(phase + 1, [_KEY["first elbow"], _KEY["second elbow"]])
-    share = np.where(drops, _hit(tau), _ease(tau))  # the elbow catches the chest
+    share = np.where(drops, hit(tau), ease(tau))  # the elbow catches the chest
     body = keys[phase] + (keys[phase + 1] - keys[phase]) * share[:, None]
-    body += np.sin(np.pi * tau)[:, None] ** 2 * _sway(rng, t)
+    body += np.sin(np.pi * tau)[:, None] ** 2 * sway(rng, t)
     for k in range(len(at) - 1):
         m = phase == k
         now = {s: x[m] for s, x in pitch.items()}
         held = _held_from(k, o, first, now, leaving=False)
-        body[m] = _settle(body[m], held, trunk=False)
+        body[m] = settle(body[m], held, trunk=False)
 
     tracks: Tracks = {"Pelvis": body[:, 0:3]}
-    up = _rotate(body[:, 9:12], np.array([0.0, 0.0, 1.0]))
+    up = rotate(body[:, 9:12], np.array([0.0, 0.0, 1.0]))
     tracks["Neck"] = body[:, 6:9] + 0.05 * up
-    tracks["Head"] = tracks["Neck"] + 0.19 * _unit(up + np.array([0.35, 0.0, 0.25]))
+    tracks["Head"] = tracks["Neck"] + 0.19 * unit(up + np.array([0.35, 0.0, 0.25]))
     clock = _Clock(t=t, at=at)
     for s, order in _orders(first):
         tracks |= _arm(s, order, clock, body, keys, _holds(o))
         tracks |= _leg(s, order, clock, body, keys, pitch[s], key_pitch[s], _holds(o))
-    return t, tracks, _true_contacts(o, first, at, float(t[-1]))
-
-
-def _sway(rng: np.random.Generator, t: np.ndarray) -> np.ndarray:
-    """(T, 12) slow unrest of a few millimetres: nobody stands like a statue."""
-    out = np.zeros((len(t), 12))
-    for column in (0, 1, 2, 6, 7, 8):
-        for frequency in rng.uniform(0.2, 0.6, size=2):
-            phase = rng.uniform(0.0, 2.0 * np.pi)
-            out[:, column] += 0.002 * np.sin(2.0 * np.pi * frequency * t + phase)
-    return out
+    return tracks, _true_contacts(o, first, at, float(t[-1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -491,41 +361,41 @@ def _arm(
     s: str, order: str, clock: _Clock, body: np.ndarray, keys: np.ndarray, holds: _Holds
 ) -> Tracks:
     """Shoulder, elbow and hand: hang, reach for the box, lie down around the wrist."""
-    sign = _SIGN[s]
-    shoulder = _joint(body, f"{s}Shoulder")
+    sign = SIGN[s]
+    shoulder = joint_of(body, f"{s}Shoulder")
     hand, elbow = f"{order} hand", f"{order} elbow"
     hold = holds.wrist[s]
     hang = np.array([0.05, sign * 0.05, -0.54])
     wrist = shoulder + hang
-    lift = _joint(keys[_KEY["ready"]], f"{s}Shoulder") + hang
+    lift = joint_of(keys[_KEY["ready"]], f"{s}Shoulder") + hang
     if order == "first":
         goes = clock.part("ready", hand)
     else:  # wait over the box until the other hand has arrived
         goes = clock.part("first hand", hand)
         wait = hold + np.array([-0.12, sign * 0.08, 0.20])
         ready = clock.part("ready", "first hand")
-        path = lift + (wait - lift) * _ease(ready)[:, None]
-        path[:, 2] += 0.10 * np.sin(np.pi * _ease(ready))
+        path = lift + (wait - lift) * ease(ready)[:, None]
+        path[:, 2] += 0.10 * np.sin(np.pi * ease(ready))
         wrist = np.where(clock.since("ready")[:, None], path, wrist)
         lift = wait
-    path = lift + (hold - lift) * _hit(goes)[:, None]
-    path[:, 2] += 0.13 * _hop(goes)
+    path = lift + (hold - lift) * hit(goes)[:, None]
+    path[:, 2] += 0.13 * hop(goes)
     wrist = np.where((goes > 0)[:, None], path, wrist)
-    wrist = _reach(shoulder, wrist, 0.995 * (UPPER_ARM + FOREARM))
+    wrist = reach(shoulder, wrist, 0.995 * (UPPER_ARM + FOREARM))
     wrist[clock.since(hand)] = hold
 
     propped = np.array([-0.35, sign * 1.0, 1.3])
-    middle = (_joint(keys[_KEY[elbow]], f"{s}Shoulder") + hold) / 2
-    pole = _blend(
-        np.array([-1.0, sign * 0.3, 0.0]), propped, _ease(clock.part("ready", hand))
+    middle = (joint_of(keys[_KEY[elbow]], f"{s}Shoulder") + hold) / 2
+    pole = blend(
+        np.array([-1.0, sign * 0.3, 0.0]), propped, ease(clock.part("ready", hand))
     )
-    down = _hit(clock.part(f"{order} lean", elbow))
-    pole = _blend(pole, holds.elbow[s] - middle, down)
-    joint = _bend(shoulder, wrist, UPPER_ARM, FOREARM, pole)
+    down = hit(clock.part(f"{order} lean", elbow))
+    pole = blend(pole, holds.elbow[s] - middle, down)
+    joint = bend(shoulder, wrist, UPPER_ARM, FOREARM, pole)
     joint[clock.since(elbow)] = holds.elbow[s]
 
-    flat = _unit(holds.heading[s] - [0.0, 0.0, (WRIST - 0.02) / 0.084])
-    along = _blend(_unit(wrist - joint), flat, _ease(1.2 * clock.part("ready", hand)))
+    flat = unit(holds.heading[s] - [0.0, 0.0, (WRIST - 0.02) / 0.084])
+    along = blend(unit(wrist - joint), flat, ease(1.2 * clock.part("ready", hand)))
     return {
         f"{s}Shoulder": shoulder,
         f"{s}Elbow": joint,
@@ -547,32 +417,32 @@ def _leg(
 ) -> Tracks:
     """Hip, knee and foot: stand, roll onto the toes, swing the knee onto the box."""
     off, on = f"{order} toe-off", f"{order} knee"
-    hip = _joint(body, f"{s}Hip")
-    pole = np.array([1.0, 0.4 * _SIGN[s], 0.2])
+    hip = joint_of(body, f"{s}Hip")
+    pole = np.array([1.0, 0.4 * SIGN[s], 0.2])
 
     def stand(
         hips: np.ndarray, angle: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        ankle = _toe_pivot(holds.toe[s], holds.ankle[s], angle)
-        knee = _bend(hips, ankle, THIGH, SHANK, pole)
+        ankle = toe_pivot(holds.toe[s], holds.ankle[s], angle)
+        knee = bend(hips, ankle, THIGH, SHANK, pole)
         return knee, ankle, np.broadcast_to(holds.toe[s], ankle.shape)
 
     knee, ankle, toe = stand(hip, pitch)
-    left = _joint(keys[_KEY[off]][None], f"{s}Hip")
+    left = joint_of(keys[_KEY[off]][None], f"{s}Hip")
     knee0, ankle0, toe0 = stand(left, key_pitch[[_KEY[off]]])
 
     goes = clock.part(off, on)
-    share = np.stack([_hit((goes - 0.2) / 0.8)] * 2 + [_hit(goes)], axis=1)
+    share = np.stack([hit((goes - 0.2) / 0.8)] * 2 + [hit(goes)], axis=1)
     path = knee0 + (holds.knee[s] - knee0) * share  # up before it goes forward
-    path[:, 1] += _SIGN[s] * 0.2 * _hop(goes)  # around the edge, rather than over it
-    path[:, 2] += 0.28 * _hop(goes)
-    swing = hip + THIGH * _unit(path - hip)
+    path[:, 1] += SIGN[s] * 0.2 * hop(goes)  # around the edge, rather than over it
+    path[:, 2] += 0.28 * hop(goes)
+    swing = hip + THIGH * unit(path - hip)
     swing[clock.since(on)] = holds.knee[s]
     lying = np.array([-1.0, 0.0, -0.12])
-    swing_ankle = swing + SHANK * _blend(ankle0 - knee0, lying, _kick(goes))
+    swing_ankle = swing + SHANK * blend(ankle0 - knee0, lying, kick(goes))
     length = np.linalg.norm(holds.toe[s] - holds.ankle[s])
     hanging = np.array([-0.45, 0.0, -0.9])
-    swing_toe = swing_ankle + length * _blend(toe0 - ankle0, hanging, _ease(goes))
+    swing_toe = swing_ankle + length * blend(toe0 - ankle0, hanging, ease(goes))
     past = clock.since(off)[:, None]
     return {
         f"{s}Hip": hip,
@@ -620,23 +490,3 @@ def _true_contacts(
                 )
             )
     return out
-
-
-def _swap(name: str) -> str:
-    return {"L": "R", "R": "L"}[name[0]] + name[1:] if name[0] in "LR" else name
-
-
-def _mirror_tracks(tracks: Tracks) -> Tracks:
-    """The same motion in a mirror that keeps the x-z plane."""
-    return {_swap(n): x * [1.0, -1.0, 1.0] for n, x in tracks.items()}
-
-
-def _mirror_contact(i: ContactInterval) -> ContactInterval:
-    w, x, y, z = i.contact.quaternion
-    contact = replace(
-        i.contact,
-        surface=_swap(i.part),
-        position=i.contact.position * [1.0, -1.0, 1.0],
-        quaternion=np.array([w, -x, y, -z]),
-    )
-    return replace(i, part=_swap(i.part), contact=contact)

@@ -11,6 +11,7 @@ posture that closes every contact, balanced and free of collisions.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -220,12 +221,18 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
     d = projected_distance(c.position, mass)
     theta = contact_angle(c.position, mass)
     length = float(np.linalg.norm(mass - c.position))
-    limit = theta_max(kin.world.supports[c.support].friction)
+    support = kin.world.supports[c.support]
+    limit = theta_max(support.friction)
+    phase = contact_phase(d, length, limit, loaded=loaded)
+    # On a slope the line to the mass must lie within the cone about the normal too.
+    slope = contact_angle(c.position, mass, support.normal)
+    if support.normal[2] < 1.0 and slope > math.atan(support.friction):
+        phase = "sliding"
     return ContactState(
         contact=c,
         projected_distance=d,
         contact_angle=theta,
-        phase=contact_phase(d, length, limit, loaded=loaded),
+        phase=phase,
     )
 
 
@@ -254,7 +261,7 @@ def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEqui
         kin.com.copy(),
         kin.world.mass,
         names=names,
-        torque=_torque_limits(kin, names, points),
+        torque=torque_limits(kin, names, points),
     )
 
 
@@ -264,15 +271,23 @@ def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
     What `equilibrium_at` says without a margin, at a hundredth of the cost.
     """
     names, points, normals, mu = bearing_frames(kin, contacts)
-    torque = _torque_limits(kin, names, points)
+    torque = torque_limits(kin, names, points)
     com, mass = kin.com.copy(), kin.world.mass
     found = contact_forces(points, normals, mu, com, mass, torque=torque)
     return found.residual <= BALANCE_TOL
 
 
-def _torque_limits(
-    kin: Kinematics, names: Sequence[str], points: np.ndarray
+def torque_limits(
+    kin: Kinematics, names: Sequence[str], points: np.ndarray, share: float = 1.0
 ) -> TorqueLimits:
+    """What the joints can bear with forces at bearing points, a share of their limits.
+
+    Args:
+        kin: At the posture.
+        names: Surface of each point.
+        points: (n, 3) in the world.
+        share: Of the effort limits.
+    """
     w = kin.world
     J = np.concatenate(
         [
@@ -284,7 +299,7 @@ def _torque_limits(
         jacobian=J,
         gravity=kin.gravity(),
         dofs=w.dadr,
-        limits=w.tau_max,
+        limits=share * w.tau_max,
         names=w.joints,
     )
 

@@ -1,0 +1,151 @@
+"""Descriptions are read with care: meshes found or named, nothing expanded."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import humanoids
+from clamber.description import compile_description, read_description
+from clamber.errors import InputError
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.1
+
+
+def stl(points: np.ndarray) -> bytes:
+    """A binary STL with enough triangles for a hull of the points."""
+    triangles = [
+        points[[i, j, k]]
+        for i in range(len(points))
+        for j in range(i + 1, len(points))
+        for k in range(j + 1, len(points))
+    ]
+    out = b"\0" * 80 + struct.pack("<I", len(triangles))
+    for t in triangles:
+        out += struct.pack("<12fH", 0, 0, 0, *t.ravel(), 0)
+    return out
+
+
+def written(folder: Path, text: str, name: str = "robot.urdf") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_package_mesh_is_found_above_the_file(tmp_path):
+    (tmp_path / "pack" / "urdf").mkdir(parents=True)
+    (tmp_path / "pack" / "meshes").mkdir()
+    (tmp_path / "pack" / "meshes" / "t.stl").write_bytes(stl(CUBE))
+    path = written(
+        tmp_path / "pack" / "urdf", humanoids.urdf(mesh="package://pack/meshes/t.stl")
+    )
+    model = compile_description(read_description(path), path)
+    assert model.nmesh == 1
+    assert model.mesh_vertnum[0] == 8
+
+
+def test_a_package_mesh_is_found_in_the_search_path(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere" / "pack").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "pack" / "t.stl").write_bytes(stl(CUBE))
+    path = written(tmp_path, humanoids.urdf(mesh="package://pack/t.stl"))
+    with pytest.raises(InputError, match=r"t\.stl"):
+        read_description(path)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "elsewhere"))
+    assert compile_description(read_description(path), path).nmesh == 1
+
+
+def test_a_missing_mesh_is_named_with_its_link(tmp_path):
+    path = written(tmp_path, humanoids.urdf(mesh="package://pack/gone.stl"))
+    with pytest.raises(InputError, match=r"'k2'.*gone\.stl.*ROS_PACKAGE_PATH"):
+        read_description(path)
+
+
+def test_a_mesh_of_another_format_is_refused_or_left_out_with_a_note(tmp_path):
+    (tmp_path / "t.dae").write_text("<COLLADA/>")
+    path = written(tmp_path, humanoids.urdf(mesh="t.dae"))
+    with pytest.raises(InputError, match=r"t\.dae"):
+        read_description(path)
+    (note,) = read_description(path, lenient=True).notes
+    assert "t.dae" in note
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        '<!DOCTYPE x [<!ENTITY a "b"><!ENTITY c "&a;&a;&a;">]>',
+        '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/hostname">]>',
+    ],
+)
+@pytest.mark.parametrize("body", [humanoids.mjcf(), humanoids.urdf()])
+def test_entities_are_not_expanded(tmp_path, head, body):
+    path = written(tmp_path, head + body, "robot.xml")
+    with pytest.raises(InputError, match="entities are not expanded"):
+        read_description(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("<mujoco><worldbody>", "XML"),
+        ("<svg/>", "svg"),
+        ("<mujoco><nonsense/></mujoco>", "MuJoCo loads"),
+        ("", "XML"),
+    ],
+)
+def test_what_is_no_description_is_refused_in_one_sentence(tmp_path, content, word):
+    path = written(tmp_path, content, "robot.xml")
+    with pytest.raises(InputError, match=word) as e:
+        read_description(path)
+    assert str(path) in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_a_document_in_another_encoding_hides_nothing(tmp_path):
+    text = '<?xml version="1.0" encoding="utf-16"?><!DOCTYPE x><robot name="a"/>'
+    (tmp_path / "r.urdf").write_bytes(text.encode("utf-16"))
+    with pytest.raises(InputError, match="UTF-8"):
+        read_description(tmp_path / "r.urdf")
+
+
+def test_the_root_of_a_urdf_keeps_its_mass(tmp_path):
+    path = written(tmp_path, humanoids.urdf())
+    model = compile_description(read_description(path), path)
+    assert model.body("k0").mass[0] == pytest.approx(5.0)
+
+
+def test_an_inertia_that_is_not_positive_is_named_or_replaced(tmp_path):
+    text = humanoids.urdf()
+    first = text.index("ixx=")
+    text = text[:first] + text[first:].replace('ixx="', 'ixx="-', 1)
+    path = written(tmp_path, text)
+    with pytest.raises(InputError, match="'k0': inertia"):
+        read_description(path)
+    mended = read_description(path, lenient=True)
+    assert "'k0': inertia" in mended.notes[0]
+    model = compile_description(mended, path)
+    # A ball of water of 5 kg: radius 0.106 m, 2/5 m r^2.
+    radius = (3 * 5.0 / (4 * np.pi * 1000)) ** (1 / 3)
+    expected = pytest.approx(0.4 * 5.0 * radius**2, rel=1e-4)
+    assert model.body("k0").inertia[0] == expected
+
+
+def test_coupled_joints_are_told(tmp_path):
+    path = written(tmp_path, humanoids.urdf(mimic_knee=True))
+    assert read_description(path).mimics == {"q3j": "p3j", "pg2": "pg1", "qg2": "qg1"}
+    xml = humanoids.mjcf().replace(
+        "</mujoco>",
+        '<equality><joint joint1="ud" joint2="td"/></equality></mujoco>',
+    )
+    assert read_description(written(tmp_path, xml, "r.xml")).mimics == {"ud": "td"}
+
+
+def test_an_mjcf_is_what_mujoco_reads(tmp_path):
+    path = written(tmp_path, humanoids.mjcf(), "r.xml")
+    ours = read_description(path).spec.compile()
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    np.testing.assert_array_equal(ours.body_inertia, theirs.body_inertia)
+    np.testing.assert_array_equal(ours.geom_pos, theirs.geom_pos)

@@ -1,0 +1,249 @@
+"""The search for contacts: what it tries first, what it finds, and why it ends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from clamber import exploration
+from clamber.contact import region_of
+from clamber.errors import InputError
+from clamber.exploration import (
+    Bounds,
+    Stop,
+    action_counts,
+    explore,
+    policy_counts,
+)
+from clamber.model import build_world
+from clamber.moves import split_moves
+from clamber.pipeline import PlanOptions
+from clamber.policy import DemoPolicy
+from clamber.posture.ik import IK
+from clamber.posture.keyframe import contact_drift
+from clamber.scaling import retarget
+from clamber.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def ik(coman):
+    return IK(build_world(coman, Scene.from_height(0.275)))
+
+
+@pytest.fixture(scope="module")
+def goal(demo_sequence, ik):
+    return retarget(demo_sequence, ik.world)
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """Every step is said to be impossible, and noted."""
+    moves = []
+
+    def fail(ik, before, step, *rest):
+        moves.append(step.move)
+        return "no"
+
+    monkeypatch.setattr(exploration, "plan_step", fail)
+    return moves
+
+
+def search(ik, goal, counts=None, start=None, **bounds):
+    counts = action_counts(goal, ik.world) if counts is None else counts
+    return explore(ik, goal, PlanOptions(), counts, Bounds(**bounds), start=start)
+
+
+def test_actions_are_counted_in_the_regions_in_which_they_are_taken(goal, ik):
+    assert action_counts(goal, ik.world) == {
+        ("G", "LHand"): 1,
+        ("M", "RHand"): 1,
+        ("M", "LElbow"): 1,
+        ("M", "RElbow"): 1,
+        ("M", "LKnee"): 1,
+        ("M", "RKnee"): 1,
+    }
+
+
+def test_a_policy_counts_the_actions_of_all_its_demonstrations(goal):
+    on = goal.stances[-1]
+    table = DemoPolicy(
+        source="one",
+        scene=goal.scene,
+        subject={},
+        states=(on,) * 5,
+        actions=("LKnee", None, "LKnee", "RElbow"),
+    )
+    policy = SimpleNamespace(demos=(table, table))
+    assert policy_counts(policy) == {("O", "LKnee"): 4, ("O", "RElbow"): 2}
+
+
+@pytest.fixture(scope="module")
+def found(ik, goal):
+    return search(ik, goal)
+
+
+def test_a_way_up_is_found_on_a_box_that_can_be_climbed(found):
+    assert found.stop is Stop.FOUND
+    assert 0 < found.states <= found.tries <= Bounds().tries
+    assert region_of(found.keyframes[-1].stance) == "O"
+    assert len(found.keyframes[-1].stance) == 4  # a surface of each limb
+
+
+def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, ik):
+    steps, skipped = split_moves(found.sequence, ik.world)
+    assert skipped == []
+    for step, path in zip(steps, found.paths, strict=True):
+        move = path.transition.move
+        assert step.move.breaks == move.breaks
+        assert step.move.makes.surface == move.makes.surface
+        assert np.allclose(step.move.makes.position, move.makes.position)
+    again = retarget(found.sequence, ik.world)
+    for a, b in zip(again.stances, found.sequence.stances, strict=True):
+        for c, d in zip(a.contacts, b.contacts, strict=True):
+            assert np.linalg.norm(c.position - d.position) < 0.01
+
+
+def test_every_keyframe_that_is_found_closes_its_contacts_and_holds(found, ik):
+    for key in found.keyframes:
+        ik.kin.update(key.q)
+        assert key.equilibrium.feasible
+        assert max(contact_drift(ik.kin, c) for c in key.stance) < 1e-3
+
+
+def test_the_same_search_finds_the_same(found, ik, goal):
+    again = search(ik, goal)
+    assert (again.states, again.tries) == (found.states, found.tries)
+    for a, b in zip(again.keyframes, found.keyframes, strict=True):
+        assert np.array_equal(a.q, b.q)
+
+
+def test_where_the_robot_is_there_already_nothing_is_planned(
+    ik, goal, demo_plan, tried
+):
+    there = search(ik, goal, start=demo_plan.keyframes[-1])
+    assert (there.stop, there.tries, there.paths) == (Stop.FOUND, 0, ())
+    assert len(there.sequence.stances) == 1
+    almost = search(ik, goal, start=demo_plan.keyframes[-2], tries=3)
+    assert almost.stop is Stop.TRIES
+
+
+def test_a_goal_in_the_scene_is_to_be_reached_too(demo_plan, coman, goal, tried):
+    key = demo_plan.keyframes[-1]
+    for off, there in ((0.1, True), (0.2, False)):
+        xy = key.q[:2] + np.array([off, 0.0])
+        ik = IK(build_world(coman, replace(demo_plan.world.scene, goal=xy)))
+        ended = search(ik, goal, start=key, tries=2)
+        assert (ended.stop is Stop.FOUND) is there
+
+
+def test_a_demonstration_that_ends_where_it_began_asks_for_a_place(ik, goal, tried):
+    """Back on the ground, on the far side of the box."""
+    far = [
+        replace(c, position=c.position + np.array([1.6, 0.0, 0.0]))
+        for c in goal.stances[0].contacts
+    ]
+    there = replace(goal.stances[0], contacts=tuple(far))
+    back = replace(goal, stances=(*goal.stances[:-1], there))
+    assert search(ik, back, tries=1).stop is Stop.TRIES  # not FOUND at once
+    here = replace(goal, stances=(*goal.stances[:-1], goal.stances[0]))
+    assert search(ik, here, tries=1).stop is Stop.FOUND
+
+
+# Bounds.
+
+
+def test_a_search_ends_when_everything_within_its_bounds_is_tried(ik, goal, tried):
+    ended = search(ik, goal, tries=1000)
+    assert ended.stop is Stop.EXHAUSTED
+    assert ended.states == 1
+    assert ended.tries == len(tried)
+    assert ended.sequence is None
+    assert len(ended.keyframes) == 1
+    moves = [
+        (m.breaks, m.makes.surface, m.makes.support, *m.makes.position.round(3))
+        for m in tried
+    ]
+    assert len(set(moves)) == len(moves)  # nothing is tried twice
+
+
+def test_no_more_steps_are_planned_than_allowed(ik, goal, tried):
+    ended = search(ik, goal, tries=3)
+    assert (ended.stop, ended.tries, len(tried)) == (Stop.TRIES, 3, 3)
+
+
+def test_without_moves_there_is_nothing(ik, goal, tried):
+    ended = search(ik, goal, depth=0)
+    assert (ended.stop, ended.states, ended.tries) == (Stop.EXHAUSTED, 0, 0)
+
+
+def test_no_sequence_is_longer_than_allowed(ik, goal, demo_plan, monkeypatch):
+    """Every step is possible, and none gets there."""
+    key, path = demo_plan.keyframes[0], demo_plan.paths[0]
+    monkeypatch.setattr(exploration, "plan_step", lambda *a: (key, path))
+    ended = search(ik, goal, tries=10_000, depth=2)
+    assert ended.stop is Stop.EXHAUSTED
+
+
+@pytest.mark.parametrize("name", ["tries", "depth"])
+def test_a_bound_is_not_negative(name):
+    with pytest.raises(InputError, match=f"{name} is -1; expected 0 or more"):
+        Bounds(**{name: -1})
+
+
+# What comes first.
+
+
+@pytest.mark.parametrize("surface", ["LHand", "RElbow", "LKnee"])
+def test_what_the_demonstration_does_most_is_tried_first(ik, goal, tried, surface):
+    counts = {("G", s): 1.0 for s in ik.world.surfaces} | {("G", surface): 50.0}
+    search(ik, goal, counts, tries=1)
+    assert tried[0].makes.surface == surface
+    assert tried[0].makes.support == "box"  # what leads nowhere can wait
+
+
+def test_counts_of_another_region_do_not_matter(ik, goal, tried):
+    even = {("G", s): 1.0 for s in ik.world.surfaces}
+    search(ik, goal, even, tries=4)
+    first = [(m.makes.surface, m.makes.support) for m in tried]
+    tried.clear()
+    search(ik, goal, even | {("O", "RKnee"): 100.0}, tries=4)
+    assert [(m.makes.surface, m.makes.support) for m in tried] == first
+
+
+def test_the_nearer_of_two_places_is_tried_first(ik, goal, tried):
+    search(ik, goal, {("G", "LHand"): 1000.0}, tries=2)
+    shoulder = ik.world.robot.limbs["left_arm"].root
+    ik.kin.update(ik.world.home)
+    root = ik.kin.landmark(shoulder)[1]
+    away = [np.linalg.norm(m.makes.position - root) for m in tried]
+    assert [m.makes.surface for m in tried] == ["LHand", "LHand"]
+    assert away[0] < away[1]
+
+
+def test_places_beyond_reach_are_not_tried(coman, demo_sequence, tried):
+    scene = Scene.from_height(0.275)
+    away = np.array([2.5, 0.0, 0.0])
+    box = replace(scene.boxes[0], position=scene.boxes[0].position + away)
+    ik = IK(build_world(coman, replace(scene, boxes=(box,))))
+    ended = search(ik, retarget(demo_sequence, ik.world), tries=1000)
+    assert ended.stop is Stop.EXHAUSTED
+    assert all(m.makes.support == "ground" for m in tried)
+
+
+def test_places_lie_on_their_supports(ik, goal, tried):
+    search(ik, goal, tries=1000)
+    for m in tried:
+        support = ik.world.supports[m.makes.support]
+        assert abs(support.height(m.makes.position)) < 1e-9
+        assert support.inside(m.makes.position)
+
+
+@pytest.mark.slow
+def test_a_box_too_high_for_all_alternatives_has_a_way_up(coman, demo_sequence):
+    ik = IK(build_world(coman, Scene.from_height(0.62)))
+    found = search(ik, retarget(demo_sequence, ik.world))
+    assert found.stop is Stop.FOUND
+    assert region_of(found.keyframes[-1].stance) == "O"

@@ -1,0 +1,324 @@
+"""Limbs, surfaces and postures are found by the tree alone, whatever it is called."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+import humanoids
+from clamber.anatomy import find_limbs, geom_points, joint_range
+from clamber.checkup import check_robot
+from clamber.errors import InputError
+from clamber.io import save_proposal
+from clamber.model import Kinematics, build_world, load_robot
+from clamber.proposal import FOREARM, UPPER_ARM, effort_of, propose_robot
+from clamber.scene import Scene
+
+TEXTS = {"mjcf": humanoids.mjcf, "urdf": humanoids.urdf}
+SUFFIX = {"mjcf": "small.xml", "urdf": "small.urdf"}
+
+
+def described(folder: Path, kind: str, text: str | None = None) -> Path:
+    path = folder / SUFFIX[kind]
+    path.write_text(TEXTS[kind]() if text is None else text)
+    return path
+
+
+@pytest.fixture(scope="module", params=["mjcf", "urdf"])
+def proposed(request, tmp_path_factory):
+    """A proposal, its robot as loaded from disk, and its world."""
+    folder = tmp_path_factory.mktemp(request.param)
+    proposal = propose_robot(described(folder, request.param))
+    out = folder / "robot"
+    out.mkdir()
+    save_proposal(proposal, out)
+    robot = load_robot(out / "robot.yaml")
+    return proposal, robot, build_world(robot, Scene(start=np.zeros(3)))
+
+
+LIMBS = {
+    "mjcf": {
+        "left_arm": ("v1", "v2"),
+        "right_arm": ("w1", "w2"),
+        "left_leg": ("t1", "t2"),
+        "right_leg": ("u1", "u2"),
+    },
+    "urdf": {
+        "left_arm": ("pa1", "pa3"),
+        "right_arm": ("qa1", "qa3"),
+        "left_leg": ("p1", "p3"),
+        "right_leg": ("q1", "q3"),
+    },
+}
+
+
+def test_limbs_are_found(proposed):
+    proposal, robot, _ = proposed
+    kind = "mjcf" if robot.base == "b0" else "urdf"
+    found = {n: (x["root"], x["middle"]) for n, x in proposal.fields["limbs"].items()}
+    assert found == LIMBS[kind]
+
+
+@pytest.mark.parametrize("name", ["coman", "coman29"])
+def test_the_built_in_robots_are_found_as_they_are_described(name):
+    robot = load_robot(name)
+    model = mujoco.MjModel.from_xml_path(str(robot.path))
+    found = find_limbs(model, name)
+    for limb, chain in found.limbs.items():
+        assert model.body(chain.root).name == robot.limbs[limb].root
+        assert model.body(chain.middle).name == robot.limbs[limb].middle
+    np.testing.assert_allclose(found.forward, [1, 0, 0], atol=1e-9)
+
+
+def test_nothing_is_wrong_with_a_proposal(proposed):
+    _, robot, _ = proposed
+    found = check_robot(robot)
+    assert found.faults == ()
+    expected = humanoids.SHANK + humanoids.ANKLE
+    assert found.knee_height == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_robot_keeps_its_mass_and_joints(proposed):
+    proposal, robot, world = proposed
+    kind = "mjcf" if robot.base == "b0" else "urdf"
+    joints, mass = {"mjcf": (23, 30.0), "urdf": (22, 34.98)}[kind]
+    assert len(world.joints) == joints
+    assert world.mass == pytest.approx(mass, abs=0.01)
+    assert not proposal.guessed
+
+
+def test_it_faces_along_x_and_stands_level_under_its_mass(proposed):
+    _, robot, world = proposed
+    kin = Kinematics(world)
+    kin.update(world.home)
+    left = kin.landmark(robot.limbs["left_leg"].root)[1]
+    right = kin.landmark(robot.limbs["right_leg"].root)[1]
+    assert left[1] > right[1] + 0.1
+    assert abs(left[0] - right[0]) < 1e-6
+    up = np.array([0.0, 0.0, 1.0])
+    soles = []
+    for name in ("LFoot", "RFoot"):
+        s = world.surfaces[name]
+        assert s.is_flat
+        normal = kin.rotation(s.body) @ s.rotation[:, 2]
+        np.testing.assert_allclose(normal, up, atol=2e-3)
+        soles.append(kin.contact_point(name, up))
+    np.testing.assert_allclose(np.array(soles)[:, 2], 0.0, atol=2e-3)
+    assert kin.com[0] == pytest.approx(np.mean(soles, axis=0)[0], abs=0.01)
+    knee = kin.landmark(robot.limbs["left_leg"].middle)[1]
+    assert knee[0] > kin.landmark(robot.limbs["left_leg"].end)[1][0] + 0.05
+
+
+def test_arms_point_as_those_of_the_built_in_robot(proposed):
+    _, robot, world = proposed
+    kin = Kinematics(world)
+    kin.update(world.home)
+    limb = robot.limbs["left_arm"]
+    a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
+    for found, wanted in ((b - a, UPPER_ARM), (c - b, FOREARM)):
+        assert found @ np.array(wanted) / np.linalg.norm(found) > np.cos(0.35)
+
+
+def test_surfaces_are_balls_and_soles_that_stand_out(proposed):
+    _, _, world = proposed
+    m = world.model
+    data = mujoco.MjData(m)
+    data.qpos[:] = world.home
+    mujoco.mj_kinematics(m, data)
+    for side in "LR":
+        for part in ("Hand", "Elbow", "Knee"):
+            s = world.surfaces[side + part]
+            assert 0.02 < s.radius < 0.12
+            assert len({int(m.geom_bodyid[g]) for g in s.geoms}) == 1
+        # The sole is the whole box that the description has.
+        sole = m.geom(f"{side}Foot").size
+        np.testing.assert_allclose(sole[:2], [0.085, 0.04], atol=2e-3)
+        # Beyond the fingers' root, the ball is the farthest of the forearm.
+        hand, elbow = world.surfaces[side + "Hand"], world.surfaces[side + "Elbow"]
+        R = data.xmat[hand.body].reshape(3, 3)
+        centre = data.xpos[hand.body] + R @ hand.centre
+        middle = data.xpos[elbow.body]
+        along = (centre - middle) / np.linalg.norm(centre - middle)
+        reach = (centre - middle) @ along + hand.radius
+        for g in elbow.geoms:
+            points = geom_points(m, data, g)
+            assert ((points - middle) @ along).max() < reach - 0.003
+
+
+def test_the_limits_of_the_description_are_kept(proposed):
+    _, _, world = proposed
+    limits = dict(zip(world.joints, world.tau_max, strict=True))
+    knee = "td" if "td" in limits else "p3j"
+    assert limits[knee] == pytest.approx(80.0)
+    elbow = "vd" if "vd" in limits else "p9j"
+    assert limits[elbow] == pytest.approx(50.0)
+
+
+def test_gains_grow_with_weight_times_height(tmp_path):
+    kp = {}
+    for scale in (1.0, 1.5):
+        folder = tmp_path / str(scale)
+        folder.mkdir()
+        proposal = propose_robot(described(folder, "mjcf", humanoids.mjcf(scale)))
+        kp[scale] = proposal.fields["gains"]["default"]["kp"]
+    assert kp[1.5] / kp[1.0] == pytest.approx(1.5**4, rel=0.06)
+
+
+def test_lengths_scale_with_the_robot(tmp_path):
+    heights = []
+    for scale in (1.0, 1.6):
+        folder = tmp_path / str(scale)
+        folder.mkdir()
+        save_proposal(
+            propose_robot(described(folder, "mjcf", humanoids.mjcf(scale))), folder
+        )
+        found = check_robot(load_robot(folder / "robot.yaml"))
+        assert found.faults == ()
+        heights.append(found.knee_height)
+    assert heights[1] / heights[0] == pytest.approx(1.6, rel=1e-3)
+
+
+def test_missing_effort_limits_are_guessed_said_so_or_taken_from_elsewhere(tmp_path):
+    path = described(tmp_path, "mjcf", humanoids.mjcf(effort=False))
+    proposal = propose_robot(path)
+    assert len(proposal.guessed) == 23
+    assert any("guesses" in n for n in proposal.notes)
+    known = tmp_path / "effort.yaml"
+    known.write_text(yaml.safe_dump({n: 42.0 for n in proposal.guessed}))
+    given = propose_robot(path, effort_from=known)
+    assert set(given.fields["effort"].values()) == {42.0}
+    assert not given.guessed
+    full = tmp_path / "full.xml"
+    full.write_text(humanoids.mjcf())
+    other = propose_robot(path, effort_from=full)
+    assert other.fields["effort"]["td"] == pytest.approx(80.0)
+    known.write_text("td: strong\n")
+    with pytest.raises(InputError, match=r"effort\.yaml: td.*strong"):
+        propose_robot(path, effort_from=known)
+
+
+def test_efforts_of_motors_count_with_their_gear():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body>
+        <joint name="a"/><geom size="0.1"/>
+        </body></worldbody><actuator>
+        <motor joint="a" gear="10" ctrlrange="-2 2" ctrllimited="true"/>
+        </actuator></mujoco>"""
+    )
+    assert effort_of(model, 0) == pytest.approx(20.0)
+
+
+def test_a_free_range_is_a_full_turn():
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body>"
+        '<joint/><geom size="0.1"/></body></worldbody></mujoco>'
+    )
+    assert joint_range(model, 0) == (-np.pi, np.pi)
+
+
+def test_a_knee_that_follows_another_is_refused(tmp_path):
+    path = described(tmp_path, "urdf", humanoids.urdf(mimic_knee=True))
+    with pytest.raises(InputError, match=r"q3j.*follows .p3j"):
+        propose_robot(path)
+
+
+def test_what_is_no_humanoid_is_refused(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco><worldbody><body name="a"><freejoint/><geom size="0.1"/>
+        <body name="b" pos="0 0 1"><joint axis="0 1 0"/><geom size="0.1"/></body>
+        </body></worldbody></mujoco>"""
+    )
+    with pytest.raises(InputError, match="two legs and two arms"):
+        propose_robot(path)
+
+
+def test_a_link_without_geometry_gets_some_and_a_note(tmp_path):
+    text = humanoids.mjcf()
+    first = text.index('<geom type="capsule"', text.index('name="t2"'))
+    end = text.index("/>", first) + 2
+    bare = (
+        text[:first]
+        + '<inertial mass="2" pos="0 0 -0.1" diaginertia="0.01 0.01 0.002"/>'
+        + text[end:]
+    )
+    proposal = propose_robot(described(tmp_path, "mjcf", bare))
+    assert any(n.startswith("t2 has no geometry") for n in proposal.notes)
+    save_proposal(proposal, tmp_path)
+    assert check_robot(load_robot(tmp_path / "robot.yaml")).faults == ()
+
+
+def test_a_link_without_inertia_gets_a_gram_and_a_note(tmp_path):
+    text = humanoids.urdf()
+    i = text.index("<inertial>", text.index('<link name="p0">'))
+    j = text.index("</inertial>", i) + len("</inertial>")
+    proposal = propose_robot(described(tmp_path, "urdf", text[:i] + text[j:]))
+    assert any("p0 has no inertia" in n for n in proposal.notes)
+
+
+def test_check_names_what_a_user_got_wrong(proposed, tmp_path):
+    proposal, _, _ = proposed
+    knee = "td" if "td" in proposal.fields["effort"] else "p3j"
+    for changes, word in (
+        (
+            {"home": {**proposal.fields["home"], knee: 3.0 if knee == "p3j" else -3.0}},
+            f"home.{knee}",
+        ),
+        ({"home": {}}, "straight"),
+        ({"effort": dict.fromkeys(proposal.fields["effort"], 1.0)}, "effort limits"),
+    ):
+        fields = {**proposal.fields, **changes}
+        (tmp_path / "robot.xml").write_text(proposal.mjcf)
+        (tmp_path / "robot.yaml").write_text(yaml.safe_dump(fields))
+        faults = check_robot(load_robot(tmp_path / "robot.yaml")).faults
+        assert any(word in f for f in faults), (word, faults)
+
+
+def test_a_robot_without_effort_limits_is_refused_by_name(proposed, tmp_path):
+    proposal, _, _ = proposed
+    (tmp_path / "robot.xml").write_text(proposal.mjcf)
+    fields = {**proposal.fields, "effort": {}}
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(fields))
+    with pytest.raises(InputError, match=r"effort\.\w+ expected its largest torque"):
+        load_robot(tmp_path / "robot.yaml")
+
+
+def test_names_of_a_description_cannot_leave_the_folder(tmp_path):
+    text = humanoids.mjcf().replace('model="small"', 'model="../../etc/x"')
+    path = tmp_path / "a b..xml"
+    path.write_text(text)
+    proposal = propose_robot(path)
+    assert "/" not in proposal.name
+    assert proposal.fields["model"] == "robot.xml"
+
+
+def test_the_g1_of_a_wheel_is_found_where_it_is_installed(tmp_path):
+    spec = importlib.util.find_spec("mjlab")
+    if spec is None or spec.origin is None:
+        pytest.skip("the mjlab wheel is not installed")
+    home = Path(spec.origin).parent / "asset_zoo" / "robots" / "unitree_g1" / "xmls"
+    proposal = propose_robot(home / "g1.xml")
+    save_proposal(proposal, tmp_path)
+    found = check_robot(load_robot(tmp_path / "robot.yaml"))
+    assert found.faults == ()
+    assert found.joints == 29
+    assert found.knee_height == pytest.approx(0.351, abs=0.002)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.9, 1.0])
+def test_a_new_robot_climbs_its_own_knee_height(proposed, demo_sequence, share):
+    from clamber.pipeline import plan
+    from clamber.simulation import judge, simulate
+
+    _, robot, _ = proposed
+    height = round(share * check_robot(robot).knee_height, 3)
+    made = plan(demo_sequence, robot, Scene.from_height(height))
+    assert made.complete
+    verdict = judge(made, simulate(made))
+    assert verdict.reached, [n for n, c in verdict.criteria.items() if not c.ok]
