@@ -308,6 +308,13 @@ def test_a_plan_that_got_no_trajectory_shows_its_keyframes(plan: Plan, tmp_path:
     assert [k["time"] for k in record["keyframes"]] == [0.0, 1.0]
 
 
+def test_a_plan_with_other_contacts_says_so(plan: Plan, tmp_path: Path):
+    io.save_plan(replace(plan, instead="hands instead of elbows"), tmp_path)
+    assert report.run_record(tmp_path)["instead"] == "hands instead of elbows"
+    io.save_plan(plan, tmp_path)
+    assert report.run_record(tmp_path)["instead"] == ""
+
+
 def test_the_table_of_stances_has_the_figures_of_the_plan(whole: Path, plan: Plan):
     rows = report.run_record(whole)["keyframes"]
     for row, key in zip(rows, plan.keyframes, strict=True):

@@ -253,6 +253,7 @@ def run_record(folder: Path) -> dict[str, Any]:
         "adapted": rollout is not None
         and rollout.followed is not None
         and bool(rollout.events),
+        "instead": written.get("instead", ""),
         "keyframes": _keyframes(written, times),
         "skipped": written.get("skipped", []),
         "options": _flat(written.get("options")),

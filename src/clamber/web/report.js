@@ -196,6 +196,7 @@ function heading(run, motion) {
     el("p", { class: "lead" }, el("span", { class: `badge ${badge[1]}` }, badge[0]), ` ${facts.join(" · ")}`),
     run.stopped && el("p", { class: "warn" }, `Stopped on the way: ${run.stopped}`),
     run.fell && el("p", { class: "warn" }, "The robot fell; the run ends there."),
+    run.instead && el("p", { class: "note" }, run.instead),
     run.adapted && el("p", { class: "note" }, "The plan was adapted on the way: “planned” below is what was followed in the end."),
     run.missing.map((text) => el("p", { class: "warn missing" }, text)),
   ];
