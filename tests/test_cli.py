@@ -21,7 +21,7 @@ from clamber import cli
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
-    *("render", "export"),
+    *("render", "report", "export"),
     *("scene", "robot", "sweep"),
 )
 
@@ -686,6 +686,86 @@ def test_a_sweep_with_a_robot_that_is_not_there_runs_nothing(
     assert cli.main(["sweep", str(spec), "--out", str(out)]) == 2
     assert "nobody" in capsys.readouterr().err
     assert not out.exists()
+
+
+# One picture of a run.
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch, stages: SimpleNamespace) -> list[tuple]:
+    """What is asked of the drawing functions, which draw nothing."""
+    asked: list[tuple] = []
+
+    def note(name: str) -> None:
+        def draw(*args: object, **options: object) -> Path:
+            asked.append((name, args, options))
+            return Path("there.png")
+
+        monkeypatch.setattr(f"clamber.viz.{name}", draw)
+
+    for name in ("render_frame", "keyframe_sheet", "video"):
+        note(name)
+    monkeypatch.setitem(vars(clamber), "load_rollout", lambda folder: "rollout")
+    return asked
+
+
+def test_render_passes_on_what_is_asked(drawn: list[tuple]):
+    frame = ["--frame", "9.5", "--transparent", "--camera", "top", "--size", "720p"]
+    assert cli.main(["render", "run", *frame, "--quiet"]) == 0
+    name, args, options = drawn.pop()
+    assert name == "render_frame"
+    assert args == (Path("run"), 9.5)
+    wanted = {"out": None, "transparent": True, "camera": "top", "size": (1280, 720)}
+    assert options == wanted
+    assert cli.main(["render", "run", "--sheet", "--size", "300x200", "--quiet"]) == 0
+    name, args, options = drawn.pop()
+    assert (name, args[1]) == ("keyframe_sheet", Path("run/keyframes.png"))
+    assert options == {"camera": "corner", "tile": (300, 200)}
+    assert cli.main(["render", "run", "--video", "--out", "a.webp", "--quiet"]) == 0
+    name, args, options = drawn.pop()
+    assert name == "video"
+    assert args[1:] == ("rollout", Path("run"))
+    assert options["out"] == Path("a.webp")
+    assert options["size"] is None
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--video", "--sheet"], "one of them"),
+        (["--frame", "1", "--video"], "one of them"),
+        (["--transparent", "--sheet"], "--transparent with --frame"),
+        (["--camera", "top"], "with --video, --sheet or --frame"),
+        (["--out", "x.png"], "with --video, --sheet or --frame"),
+        (
+            ["--frame", "1", "--size", "huge"],
+            "--size is 'huge'; expected such as 1080p",
+        ),
+        (["--frame", "1", "--size", "641x480"], "even numbers"),
+        (["--video", "--size", "9999p"], "from 64 to 4096"),
+        (["--frame", "1", "--camera", "below"], "--camera"),
+        (["--sheet", "--out", "x.jpg"], "ends in .png"),
+    ],
+)
+def test_flags_of_a_picture_that_do_not_fit_are_one_sentence(
+    flags: list[str],
+    said: str,
+    drawn: list[tuple],
+    capsys: pytest.CaptureFixture[str],
+):
+    assert cli.main(["render", "run", *flags]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert err.count("\n") == 1
+    assert drawn == []
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1080p", (1920, 1080)), ("480p", (854, 480)), ("2160p", (3840, 2160))],
+)
+def test_sizes_by_their_lines_are_16_to_9(text: str, size: tuple[int, int]):
+    assert cli._picture_size(text) == size
 
 
 # Learning.

@@ -66,6 +66,7 @@ LAYERS = [
     "curves",
     "policy_plots",
     "view",
+    "meshes",
     "report",
     "",  # the package itself: its public names
     "cli",

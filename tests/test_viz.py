@@ -206,8 +206,8 @@ def test_a_surface_stands_on_the_support_below_it(plan: Plan, rollout: Rollout):
 
 def test_contact_in_the_plot_begins_and_ends_with_the_load():
     mask = np.array([1, 1, 0, 0, 1, 0, 1], dtype=bool)
-    assert viz._runs(mask) == [(0, 2), (4, 5), (6, 7)]
-    assert viz._runs(np.zeros(3, dtype=bool)) == []
+    assert viz.runs_of(mask) == [(0, 2), (4, 5), (6, 7)]
+    assert viz.runs_of(np.zeros(3, dtype=bool)) == []
 
 
 # Files.
@@ -391,3 +391,123 @@ def test_loading_the_module_changes_no_setting():
         env={k: v for k, v in os.environ.items() if k != "MUJOCO_GL"},
     )  # fmt: skip
     assert json.loads(out.stdout) == {}
+
+
+# One picture, from where it is wanted.
+
+
+@pytest.fixture(scope="module")
+def run(plan: Plan, rollout: Rollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    io.save_plan(plan, folder)
+    io.save_rollout(plan, rollout, folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("camera", "way"),
+    [
+        ("side", [0, -1, 0]),
+        ("front", [-1, 0, 0]),
+        ("behind", [1, 0, 0]),
+        ("top", [0, 0, -1]),
+    ],
+)
+def test_cameras_look_from_where_their_name_says(camera: viz.Preset, way: list[float]):
+    """Of a robot that faces along x; turned with it."""
+    points = np.random.default_rng(3).normal(size=(20, 3))
+    forward = viz.frame_view(points, 1.5, camera=camera).axes[2]
+    assert forward @ way > 0.9
+    turned = viz.frame_view(points, 1.5, yaw=np.pi / 2, camera=camera).axes[2]
+    np.testing.assert_allclose(turned, [-forward[1], forward[0], forward[2]], atol=1e-9)
+
+
+def test_a_frame_shows_the_state_at_its_time(
+    run: Path, rollout: Rollout, tmp_path: Path, pictures: None
+):
+    a = viz.render_frame(run, 1.0, size=SIZE, out=tmp_path / "a.png")
+    size = SIZE[0] / SIZE[1]
+    view = viz.view_of(rollout.world, viz._some(rollout.qpos, 60), size)
+    row = int(np.argmin(np.abs(rollout.time - 1.0)))
+    with viz.Camera(rollout.world, SIZE) as camera:
+        wanted = np.asarray(camera.shot(rollout.qpos[row], view)).astype(int)
+    assert np.array_equal(pixels(a), wanted)
+    b = viz.render_frame(run, 1.0, size=SIZE, camera="front", out=tmp_path / "b.png")
+    assert np.mean(np.any(pixels(a) != pixels(b), axis=2)) > 0.2
+
+
+def test_a_frame_of_a_plan_needs_no_physics(plan: Plan, tmp_path: Path, pictures: None):
+    io.save_plan(plan, tmp_path)
+    path = viz.render_frame(tmp_path, 0.5, size=SIZE)
+    assert path == tmp_path / "frame-0.5.png"
+    assert pixels(path).std() > 10
+
+
+def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(
+    run: Path, rollout: Rollout, tmp_path: Path, pictures: None
+):
+    size = (320, 240)
+    path = viz.render_frame(
+        run, 0.0, size=size, transparent=True, out=tmp_path / "t.png"
+    )
+    with Image.open(path) as picture:
+        assert picture.mode == "RGBA"
+        assert picture.size == size
+        rgba = np.asarray(picture).astype(int)
+    alpha = rgba[..., 3]
+    world = rollout.world
+    view = viz.view_of(world, viz._some(rollout.qpos, 60), size[0] / size[1])
+    kin = Kinematics(world)
+    kin.update(rollout.qpos[0])
+    x, y = view.project(kin.com, size).round().astype(int)
+    assert alpha[y, x] == 255
+    assert alpha[0].max() == 0  # the sky
+    assert 0.1 < np.mean(alpha == 0) < 0.9
+    edge = (alpha > 0) & (alpha < 255)
+    assert 0.001 < edge.mean() < 0.05  # smooth, and thin
+    ground = np.array([[0.0, 1.5, 0.0], [0.0, -0.6, 0.0]])
+    for x, y in view.project(ground, size).round().astype(int):
+        if 0 <= x < size[0] and 0 <= y < size[1]:
+            assert alpha[y, x] == 0
+
+
+@pytest.mark.parametrize("time", [-0.1, 1e6, float("nan")])
+def test_a_time_that_the_run_has_not_is_one_sentence(run: Path, time: float):
+    with pytest.raises(InputError, match="expected a time from 0 to"):
+        viz.render_frame(run, time, size=SIZE)
+
+
+def test_a_picture_has_the_ending_of_its_format(
+    run: Path, plan: Plan, rollout: Rollout
+):
+    with pytest.raises(InputError, match=r"ends in \.png"):
+        viz.render_frame(run, 0.0, out=run / "a.gif")
+    with pytest.raises(InputError, match=r"\.mp4 or \.webp"):
+        viz.video(plan, rollout, run, out=run / "a.avi")
+
+
+def test_an_mp4_without_ffmpeg_says_what_brings_it(
+    run: Path, plan: Plan, rollout: Rollout, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(clamber.MissingDependency, match=r"clamber\[video\]"):
+        viz.video(plan, rollout, run, out=run / "a.mp4")
+
+
+def test_a_video_has_the_size_and_side_that_was_asked(
+    plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
+):
+    frames = {}
+    for camera in ("corner", "behind"):
+        path = viz.video(
+            plan,
+            short(rollout),
+            tmp_path,
+            out=tmp_path / f"{camera}.webp",
+            size=(200, 120),
+            camera=camera,
+        )
+        with Image.open(path) as picture:
+            assert picture.size == (200, 120)
+            frames[camera] = np.asarray(picture.convert("RGB")).astype(int)
+    assert np.abs(frames["corner"] - frames["behind"]).mean() > 5

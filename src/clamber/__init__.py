@@ -40,6 +40,7 @@ _HOME = {
     "Proposal": "proposal",
     "Ranked": "alternatives",
     "Replanned": "alternatives",
+    "Reported": "report",
     "Robot": "model",
     "Rollout": "simulation",
     "Scene": "scene",
@@ -66,6 +67,7 @@ _HOME = {
     "load_plan": "io",
     "load_policy": "io",
     "load_robot": "model",
+    "load_rollout": "io",
     "load_scene": "scene",
     "load_sequence": "io",
     "load_spec": "experiment",
@@ -92,6 +94,7 @@ _HOME = {
     "save_verdict": "io",
     "simulate": "simulation",
     "write_c3d": "demo",
+    "write_report": "report",
     "write_trc": "demo",
 }
 

@@ -25,6 +25,7 @@ from clamber.export import Exported as Exported
 from clamber.export import export_run as export_run
 from clamber.io import load_plan as load_plan
 from clamber.io import load_policy as load_policy
+from clamber.io import load_rollout as load_rollout
 from clamber.io import load_sequence as load_sequence
 from clamber.io import new_run_folder as new_run_folder
 from clamber.io import save_plan as save_plan
@@ -52,6 +53,8 @@ from clamber.policy import PelvisDistribution as PelvisDistribution
 from clamber.policy import pelvis_distribution as pelvis_distribution
 from clamber.proposal import Proposal as Proposal
 from clamber.proposal import propose_robot as propose_robot
+from clamber.report import Reported as Reported
+from clamber.report import write_report as write_report
 from clamber.scene import Box as Box
 from clamber.scene import Scene as Scene
 from clamber.scene import Support as Support

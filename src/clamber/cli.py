@@ -663,18 +663,134 @@ def _policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderCommand:
-    """Draw pictures and a video of a run."""
+    """Draw pictures and a video of a run, all of them or one."""
 
     run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """A run folder that holds a rollout."""
+    """A run folder that holds a plan."""
+    video: bool = False
+    """The video alone: MP4 with clamber[video], else an animated WebP."""
+    sheet: bool = False
+    """The sheet of keyframes alone."""
+    frame: Annotated[float | None, tyro.conf.arg(metavar="T")] = None
+    """One picture alone, at that time [s]."""
+    camera: Literal["corner", "side", "front", "behind", "top"] = "corner"
+    """From where."""
+    transparent: bool = False
+    """Robot and obstacles on nothing; with --frame."""
+    size: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="1080p|WxH", help_behavior_hint="(default: frames 1080p)"
+        ),
+    ] = None
+    """Of the video, the frame, or each picture of the sheet."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: in RUN)"),
+    ] = None
+    """The file."""
     output: Printed
 
     def run(self) -> int:
-        """Rollout to pictures."""
+        """Run to pictures."""
+        self._check()
         with self.output.progress() as report:
-            files = clamber.render_run(self.run_folder, report=report)
+            files = self._draw(report)
         names = [str(f) for f in files]
         self.output.show({"files": names}, note="\n".join(names))
+        return REACHED
+
+    def _check(self) -> None:
+        """One of the three, and flags that go with it."""
+        asked = [self.video, self.sheet, self.frame is not None]
+        if sum(asked) > 1:
+            raise InputError("--video, --sheet or --frame, one of them")
+        if self.transparent and self.frame is None:
+            raise InputError("--transparent with --frame alone")
+        special = self.camera != "corner" or self.size or self.out
+        if special and not any(asked):
+            raise InputError(
+                "--camera, --size and --out with --video, --sheet or --frame"
+            )
+
+    def _draw(self, report: Report) -> list[Path]:
+        if not (self.video or self.sheet or self.frame is not None):
+            return clamber.render_run(self.run_folder, report=report)
+        from clamber import viz
+
+        size = None if self.size is None else _picture_size(self.size)
+        given: dict[str, Any] = {"camera": self.camera}
+        try:
+            if self.frame is not None:
+                given |= {"out": self.out, "transparent": self.transparent}
+                given |= {} if size is None else {"size": size}
+                return [viz.render_frame(self.run_folder, self.frame, **given)]
+            plan = clamber.load_plan(self.run_folder)
+            if self.sheet:
+                path = self.out or self.run_folder / "keyframes.png"
+                if path.suffix != ".png":
+                    raise InputError("a name that ends in .png", source=path)
+                given |= {} if size is None else {"tile": size}
+                return [viz.keyframe_sheet(plan, path, **given)]
+            rollout = clamber.load_rollout(self.run_folder)
+            given |= {"out": self.out, "size": size, "report": report}
+            return [viz.video(plan, rollout, self.run_folder, **given)]
+        except OSError as e:
+            raise InputError(
+                f"a file that can be written ({e.strerror or e})",
+                source="--out",
+                value=str(self.out or self.run_folder),
+            ) from e
+
+
+def _picture_size(text: str) -> tuple[int, int]:
+    """Width and height of `1080p` (16 to 9) or `1280x720`; even, as videos need."""
+    lines = re.fullmatch(r"(\d{1,5})p", text)
+    sides = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if lines:
+        height = int(lines[1])
+        size = (2 * round(height * 8 / 9), height)
+    elif sides:
+        size = (int(sides[1]), int(sides[2]))
+    else:
+        size = (0, 0)
+    if not all(64 <= x <= 4096 and x % 2 == 0 for x in size):
+        raise InputError(
+            "such as 1080p or 1280x720, even numbers from 64 to 4096",
+            source="--size",
+            value=text,
+        )
+    return size
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportCommand:
+    """Write a run as one HTML file: an animation to turn and scrub, plots, tables."""
+
+    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """A run folder, whole or not."""
+    compare: Annotated[Path | None, tyro.conf.arg(metavar="RUN2")] = None
+    """Another run, laid beside it."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: RUN/report.html)"),
+    ] = None
+    """The file."""
+    output: Printed
+
+    def run(self) -> int:
+        """Run to one page."""
+        with self.output.progress() as report:
+            report("report", 0.0, "")
+            done = clamber.write_report(
+                self.run_folder, compare=self.compare, out=self.out
+            )
+            report("report", 1.0, "")
+        if not self.output.quiet:
+            for text in done.missing:
+                sys.stderr.write(f"clamber: {text}\n")
+        record = {"file": str(done.file), "missing": list(done.missing)}
+        self.output.show(record, note=str(done.file))
         return REACHED
 
 
@@ -944,6 +1060,7 @@ Command = (
     | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
+    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]

@@ -18,7 +18,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import IO, Any, TypeVar, get_args, get_type_hints
@@ -930,10 +930,15 @@ def save_proposal(proposal: Proposal, folder: str | Path) -> None:
             stream.write(text.encode())
 
 
-def load_plan(folder: str | Path) -> Plan:
+def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     """Read what `save_plan` wrote, all but the paths.
 
     World and trajectory are the planned ones, whatever a run has made of them since.
+
+    Args:
+        folder: The run folder.
+        without: Of `trajectory.npz` and `timings.json`, what is not read: it may be
+            broken then.
 
     Raises:
         InputError: A file is missing, broken, or does not fit the others.
@@ -976,10 +981,10 @@ def load_plan(folder: str | Path) -> Plan:
                     value=f"{c.surface} on {c.support}",
                 )
     trajectory = None
-    if followed.exists() or file.complete:
+    if TRAJECTORY not in without and (followed.exists() or file.complete):
         trajectory = load_trajectory(followed, world)
     timings: dict[str, float] = {}
-    if (folder / TIMINGS).exists():
+    if TIMINGS not in without and (folder / TIMINGS).exists():
         timings = _read_json(folder / TIMINGS, _TimingsFile).seconds
     return Plan(
         world=world,
@@ -1257,8 +1262,13 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     )
 
 
-def load_rollout(folder: str | Path) -> Rollout:
+def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     """Read what `save_rollout` wrote.
+
+    Args:
+        folder: The run folder.
+        with_events: Without them, `execution.json` may be broken: nothing is said of
+            events or a fall, and the scene is the planned one.
 
     Raises:
         InputError: A file is missing or broken.
@@ -1294,9 +1304,30 @@ def load_rollout(folder: str | Path) -> Rollout:
             values[name] = kind(f.get(name).item())
     if "push" in f:
         values["push"] = f.get("push", steps, 3)
-    file = _read_json(folder / EXECUTION, _ExecutionFile)
-    robot = _robot(_read_json(folder / PLAN, _PlanFile).robot)
-    world = _load_world(folder / SCENE, robot, file.scene.scene())
+    planned = _read_json(folder / PLAN, _PlanFile)
+    if with_events:
+        file = _read_json(folder / EXECUTION, _ExecutionFile)
+    else:
+        file = _ExecutionFile(
+            scene=planned.sequence.scene, events=[], fell=False, stopped="", rests_on=[]
+        )
+    world = _load_world(folder / SCENE, _robot(planned.robot), file.scene.scene())
+    m = world.model
+    for name, n in (("qpos", m.nq), ("qvel", m.nv), ("ctrl", m.nu)):
+        if values[name].shape[1] != n:
+            raise InputError(
+                f"{n} columns, as {SCENE} has it",
+                source=f.path,
+                field=name,
+                value=f"{values[name].shape[1]} columns",
+            )
+    if values["surfaces"] != tuple(world.surfaces):
+        raise InputError(
+            f"those of {SCENE}, {', '.join(world.surfaces)}",
+            source=f.path,
+            field="surfaces",
+            value=", ".join(values["surfaces"]),
+        )
     followed = None
     if (folder / PLANNED_TRAJECTORY).exists():
         followed = load_trajectory(folder / TRAJECTORY, world)
@@ -1364,3 +1395,38 @@ def load_verdict(folder: str | Path) -> Verdict:
             for n, c in file.criteria.items()
         },
     )
+
+
+# Files by themselves.
+
+
+_KINDS: dict[str, type[pydantic.BaseModel]] = {
+    PLAN: _PlanFile,
+    SEQUENCE: _SequenceFile,
+    EXECUTION: _ExecutionFile,
+    VERDICT: _VerdictFile,
+    TIMINGS: _TimingsFile,
+}
+
+
+def load_fields(folder: str | Path, name: str) -> dict[str, Any]:
+    """What a JSON file of a run folder says, as it is written, once it is checked.
+
+    For what is shown of a run whose other files are missing or broken.
+
+    Args:
+        folder: The run folder.
+        name: `plan.json`, `sequence.json`, `execution.json`, `verdict.json` or
+            `timings.json`.
+
+    Raises:
+        InputError: It is missing or broken.
+    """
+    path = Path(folder) / name
+    _read_json(path, _KINDS[name])
+    text = path.read_text()
+    try:  # what is read as it is written has numbers for numbers
+        _KINDS[name].model_validate_json(text, strict=True)
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    return json.loads(text)

@@ -16,11 +16,11 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -30,7 +30,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from clamber.contact import Contact, ContactSequence
 from clamber.demo import Demonstration
-from clamber.errors import ClamberError
+from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.io import ROLLOUT, load_plan, load_rollout, whole_file
 from clamber.model import Kinematics, Robot, World, build_world
 from clamber.pipeline import Plan
@@ -39,8 +39,16 @@ from clamber.scene import GROUND, Scene, Support
 from clamber.simulation import Rollout
 from clamber.statics import com_margin, projected_distance, support_polygon, theta_max
 
-AZIMUTH, ELEVATION = 288.0, -17.0  # [deg] from the left, a little behind: the box hides
-# neither the feet on the ground nor the hands on its top
+Preset = Literal["corner", "side", "front", "behind", "top"]
+PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation, of a
+    # robot that faces along x. From the left and a little behind, the box hides neither
+    # the feet on the ground nor the hands on its top.
+    "corner": (288.0, -17.0),
+    "side": (270.0, -8.0),
+    "front": (180.0, -14.0),
+    "behind": (0.0, -20.0),
+    "top": (270.0, -89.0),
+}
 MARGIN = 0.08  # share of the picture left free around what must be seen
 EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
 GROUND_SHOWN = 5.5  # [m] half width of the ground in pictures
@@ -48,7 +56,9 @@ LOADED = 0.01  # [weights] a surface that bears more is loaded
 TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
 SAMPLES = 400  # of a plot over time
 FPS = 25
-VIDEO_SIZE = (640, 480)
+VIDEO_SIZE, WEBP_SIZE = (640, 480), (480, 360)
+FRAME_SIZE = (1920, 1080)
+TILE = (400, 330)  # of the sheet of keyframes
 VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
 SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
 
@@ -157,7 +167,12 @@ class Camera:
     """Draws configurations of a world; closed as a context manager."""
 
     def __init__(
-        self, world: World, size: tuple[int, int], *, smooth: bool = True
+        self,
+        world: World,
+        size: tuple[int, int],
+        *,
+        smooth: bool = True,
+        cutout: bool = False,
     ) -> None:
         """Open a context.
 
@@ -165,19 +180,24 @@ class Camera:
             world: What to draw.
             size: Width and height in pixels.
             smooth: Edges are smoothed; costs three times the time in software.
+            cutout: For `cutout`, which smooths edges by itself; `shot` then lacks the
+                ground.
         """
         self._gl: Any = None
         self._context: Any = None
-        width, height = size
+        width, height = size if not cutout else (2 * size[0], 2 * size[1])
         model = copy.copy(world.model)  # looks are set here, the world's stay
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        model.vis.quality.offsamples = 4 if smooth else 0
-        model.vis.quality.shadowsize = 2048
+        model.vis.quality.offsamples = 4 if smooth and not cutout else 0
+        model.vis.quality.shadowsize = 2048 if height < 700 else 8192  # no steps seen
         if not smooth:
             model.vis.quality.numslices, model.vis.quality.numstacks = 16, 8
         # A ground without end is shaded with speckles where the shadow map ends.
         model.vis.map.shadowclip = 4.0
         model.geom_size[world.support_geom[GROUND], :2] = GROUND_SHOWN
+        if cutout:
+            model.geom_matid[world.support_geom[GROUND]] = -1
+            model.geom_rgba[world.support_geom[GROUND], 3] = 0.0
         self._model, self._data = model, mujoco.MjData(model)
         self._gl = _gl_context(width, height)
         self._gl.make_current()
@@ -203,6 +223,35 @@ class Camera:
 
     def shot(self, q: np.ndarray, view: View) -> Image.Image:
         """A picture of the configuration `q` (nq,)."""
+        self._update(q, view)
+        return Image.fromarray(self._drawn())
+
+    def cutout(self, q: np.ndarray, view: View) -> Image.Image:
+        """Robot and obstacles alone (RGBA), on nothing.
+
+        Drawn twice as large without smoothing, so that no pixel mixes with what lies
+        behind it, and averaged with its mask: edges keep their own colour.
+        """
+        self._update(q, view)
+        colour = self._drawn().astype(float)
+        flags = (
+            mujoco.mjtRndFlag.mjRND_SEGMENT.value,
+            mujoco.mjtRndFlag.mjRND_IDCOLOR.value,
+        )
+        self._scene.flags[list(flags)] = 1
+        there = np.any(self._drawn() > 0, axis=2)[..., None].astype(float)
+        self._scene.flags[list(flags)] = 0
+        height, width = there.shape[0] // 2, there.shape[1] // 2
+
+        def halved(x: np.ndarray) -> np.ndarray:
+            return x.reshape(height, 2, width, 2, -1).mean(axis=(1, 3))
+
+        share = halved(there)
+        colour = halved(colour * there) / np.maximum(share, 1e-9)
+        pixels = np.concatenate([colour, 255 * share], axis=2)
+        return Image.fromarray(pixels.round().astype(np.uint8), "RGBA")
+
+    def _update(self, q: np.ndarray, view: View) -> None:
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -218,13 +267,21 @@ class Camera:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             self._scene,
         )
+
+    def _drawn(self) -> np.ndarray:
+        """(height, width, 3) uint8 of the scene as it was last updated."""
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
-        return Image.fromarray(self._pixels[::-1])
+        return self._pixels[::-1].copy()
 
 
 def frame_view(
-    points: np.ndarray, aspect: float, *, yaw: float = 0.0, fovy: float = 45.0
+    points: np.ndarray,
+    aspect: float,
+    *,
+    yaw: float = 0.0,
+    fovy: float = 45.0,
+    camera: Preset = "corner",
 ) -> View:
     """The nearest view that has all of the points (N, 3) in the picture.
 
@@ -237,9 +294,11 @@ def frame_view(
         aspect: Width over height of the picture.
         yaw: Way the robot faces at its start [rad].
         fovy: Vertical field of view [deg].
+        camera: From where.
     """
-    azimuth = AZIMUTH + math.degrees(yaw)
-    right, up, forward = _camera_axes(azimuth, ELEVATION)
+    azimuth, elevation = PRESETS[camera]
+    azimuth += math.degrees(yaw)
+    right, up, forward = _camera_axes(azimuth, elevation)
     depth = points @ forward
     half = math.tan(math.radians(fovy) / 2) * (1 - MARGIN)
     ends, nearest = [], math.inf
@@ -254,7 +313,7 @@ def frame_view(
         lookat=position + distance * forward,
         distance=distance,
         azimuth=azimuth,
-        elevation=ELEVATION,
+        elevation=elevation,
         fovy=fovy,
     )
 
@@ -269,7 +328,12 @@ def robot_corners(kin: Kinematics) -> np.ndarray:
     return (np.einsum("gij,gkj->gki", R, local) + d.geom_xpos[own, None]).reshape(-1, 3)
 
 
-def view_of(world: World, postures: Iterable[np.ndarray], aspect: float) -> View:
+def view_of(
+    world: World,
+    postures: Iterable[np.ndarray],
+    aspect: float,
+    camera: Preset = "corner",
+) -> View:
     """A view with the robot in all postures, and the near edge of the first box."""
     kin = Kinematics(world)
     points = []
@@ -279,7 +343,8 @@ def view_of(world: World, postures: Iterable[np.ndarray], aspect: float) -> View
     points += [near_edge_points(world.scene)]
     fovy = float(world.model.vis.global_.fovy)
     seen = np.concatenate(points)
-    return frame_view(seen, aspect, yaw=float(world.scene.start[2]), fovy=fovy)
+    yaw = float(world.scene.start[2])
+    return frame_view(seen, aspect, yaw=yaw, fovy=fovy, camera=camera)
 
 
 def near_edge_points(scene: Scene) -> np.ndarray:
@@ -365,7 +430,11 @@ def draw_robot(
 
 
 def keyframe_sheet(
-    plan: Plan, path: str | Path, *, tile: tuple[int, int] = (400, 330)
+    plan: Plan,
+    path: str | Path,
+    *,
+    tile: tuple[int, int] = TILE,
+    camera: Preset = "corner",
 ) -> Path:
     """Draw each keyframe with its contacts, forces and margins.
 
@@ -374,11 +443,11 @@ def keyframe_sheet(
     contact forces; a line falls from the centre of mass.
     """
     world = plan.world
-    view = view_of(world, [k.q for k in plan.keyframes], tile[0] / tile[1])
+    view = view_of(world, [k.q for k in plan.keyframes], tile[0] / tile[1], camera)
     tiles = []
-    with Camera(world, tile) as camera:
+    with Camera(world, tile) as drawing:
         for i, key in enumerate(plan.keyframes):
-            picture = camera.shot(key.q, view)
+            picture = drawing.shot(key.q, view)
             mark_keyframe(picture, view, world, key)
             before = plan.keyframes[i - 1] if i else None
             tiles.append((picture, keyframe_caption(i, key, before)))
@@ -577,7 +646,7 @@ def contact_plot(plan: Plan, rollout: Rollout, path: str | Path) -> Path:
     loaded = loaded_surfaces(world, rollout)
     tracks = {s: heights[:, i] for i, s in enumerate(rollout.surfaces)}
     contact = {
-        s: [(rollout.time[a], rollout.time[b - 1]) for a, b in _runs(loaded[:, i])]
+        s: [(rollout.time[a], rollout.time[b - 1]) for a, b in runs_of(loaded[:, i])]
         for i, s in enumerate(rollout.surfaces)
     }
     panels = _limb_panels(world.robot)
@@ -604,7 +673,7 @@ def loaded_surfaces(world: World, rollout: Rollout) -> np.ndarray:
     return force > LOADED * world.mass * 9.81
 
 
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+def runs_of(mask: np.ndarray) -> list[tuple[int, int]]:
     """Half-open ranges in which a boolean (M,) mask is true."""
     steps = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return list(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
@@ -709,15 +778,32 @@ def stability_over_time(
         limit: (n, nS) l sin(theta_max) in the present posture [m].
         margin: (n,) of the centre of mass [m], NaN where nothing is loaded.
     """
-    kin = Kinematics(world)
     loaded = loaded_surfaces(world, rollout)[rows]
+    return stability_of(world, rollout.qpos[rows], loaded, rollout.surfaces)
+
+
+def stability_of(
+    world: World, postures: np.ndarray, loaded: np.ndarray, surfaces: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geometric stability (4.17) of postures (n, nq) on the surfaces that bear.
+
+    Args:
+        world: Robot and supports.
+        postures: (n, nq).
+        loaded: (n, nS) bool, the surfaces that bear.
+        surfaces: Names of the nS surfaces.
+
+    Returns:
+        As `stability_over_time`.
+    """
+    kin = Kinematics(world)
     d = np.full(loaded.shape, np.nan)
-    limit, margin = d.copy(), np.full(len(rows), np.nan)
-    for i, row in enumerate(rows):
-        kin.update(rollout.qpos[row])
+    limit, margin = d.copy(), np.full(len(postures), np.nan)
+    for i, q in enumerate(postures):
+        kin.update(q)
         bearing = []
         for j in np.flatnonzero(loaded[i]):
-            surface = rollout.surfaces[j]
+            surface = surfaces[int(j)]
             support = support_below(world, kin, surface)
             point = kin.contact_point(surface, support.normal)
             mass = kin.landmark(world.robot.limb_of(surface).root)[1]
@@ -788,16 +874,42 @@ def speedup_of(duration: float) -> int:
 
 
 def video(
-    plan: Plan, rollout: Rollout, folder: str | Path, *, report: Report | None = None
+    plan: Plan,
+    rollout: Rollout,
+    folder: str | Path,
+    *,
+    out: str | Path | None = None,
+    size: tuple[int, int] | None = None,
+    camera: Preset = "corner",
+    report: Report | None = None,
 ) -> Path:
-    """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg."""
-    folder = Path(folder)
-    if importlib.util.find_spec("imageio_ffmpeg"):
-        path, fps, size = folder / "video.mp4", FPS, VIDEO_SIZE
-    else:
-        path, fps, size = folder / "video.webp", FPS / 2, (480, 360)
+    """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg.
+
+    Args:
+        plan: What was to be done.
+        rollout: What physics made of it.
+        folder: Where the video goes under its usual name.
+        out: The file instead, an `.mp4` or a `.webp`.
+        size: Width and height in pixels, even numbers.
+        camera: From where.
+        report: Told of the share done.
+
+    Raises:
+        InputError: Another ending.
+        MissingDependency: An `.mp4` was asked for and there is no ffmpeg.
+    """
+    has_ffmpeg = importlib.util.find_spec("imageio_ffmpeg") is not None
+    if out is None:
+        out = Path(folder) / ("video.mp4" if has_ffmpeg else "video.webp")
+    path = Path(out)
+    if path.suffix not in (".mp4", ".webp"):
+        raise InputError("a name that ends in .mp4 or .webp", source=path)
+    if path.suffix == ".mp4" and not has_ffmpeg:
+        raise MissingDependency("imageio-ffmpeg", "video")
+    fps, usual = (FPS, VIDEO_SIZE) if path.suffix == ".mp4" else (FPS / 2, WEBP_SIZE)
+    size = size or usual
     frames = _frames(
-        plan, rollout, fps, size, report or (lambda stage, share, note: None)
+        plan, rollout, fps, size, camera, report or (lambda stage, share, note: None)
     )
     with whole_file(path) as draft:
         if path.suffix == ".mp4":
@@ -816,7 +928,12 @@ def video(
 
 
 def _frames(
-    plan: Plan, rollout: Rollout, fps: float, size: tuple[int, int], report: Report
+    plan: Plan,
+    rollout: Rollout,
+    fps: float,
+    size: tuple[int, int],
+    camera: Preset,
+    report: Report,
 ) -> Iterator[Image.Image]:
     """Pictures of the rollout with its clock and the move under way."""
     duration = float(rollout.time[-1])
@@ -829,20 +946,22 @@ def _frames(
         size[0] * 5 // 4,
         size[1] * 5 // 4,
     )  # smoother edges at a third of the price
-    view = view_of(rollout.world, _some(rollout.qpos, 60), size[0] / size[1])
-    with Camera(rollout.world, drawn, smooth=False) as camera:
+    view = view_of(rollout.world, _some(rollout.qpos, 60), size[0] / size[1], camera)
+    letters = max(18, round(size[1] / 30))
+    with Camera(rollout.world, drawn, smooth=False) as drawing:
         for i, (row, t) in enumerate(zip(rows, times, strict=True)):
             if i % 10 == 0:
                 report("video", i / len(rows), "")
-            picture = camera.shot(rollout.qpos[row], view)
+            picture = drawing.shot(rollout.qpos[row], view)
             picture = picture.resize(size, Image.Resampling.BILINEAR)
             move = int(np.searchsorted(starts, t, side="right"))
             text = moves[move - 1] if 1 <= move <= len(moves) else "done"
             clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
             draw = ImageDraw.Draw(picture)
-            draw.text((12, size[1] - 28), clock, font=_font(18), fill=DARK)
-            at = (size[0] - 12, size[1] - 28)
-            draw.text(at, text, font=_font(18), fill=DARK, anchor="ra")
+            line = size[1] - letters - 10
+            draw.text((12, line), clock, font=_font(letters), fill=DARK)
+            at = (size[0] - 12, line)
+            draw.text(at, text, font=_font(letters), fill=DARK, anchor="ra")
             yield picture
     report("video", 1.0, "")
 
@@ -921,3 +1040,52 @@ def render_run(
         if with_video:
             files.append(video(plan, rollout, folder, report=tell))
     return files
+
+
+def render_frame(
+    folder: str | Path,
+    time: float,
+    *,
+    out: str | Path | None = None,
+    size: tuple[int, int] = FRAME_SIZE,
+    camera: Preset = "corner",
+    transparent: bool = False,
+) -> Path:
+    """Draw a run at one time as a PNG.
+
+    Args:
+        folder: A run folder; the plan is drawn where physics has not run.
+        time: [s]; the state at that time, or the last one before.
+        out: The file; `frame-<time>.png` in the run folder by default.
+        size: Width and height in pixels.
+        camera: From where.
+        transparent: Robot and obstacles alone, on nothing.
+
+    Raises:
+        InputError: A file is missing or broken, or there is no such time.
+        ClamberError: There is no OpenGL.
+    """
+    folder = Path(folder)
+    if (folder / ROLLOUT).exists():
+        motion = load_rollout(folder)
+        world, t, q = motion.world, motion.time, motion.qpos
+    else:
+        plan = load_plan(folder)
+        if plan.trajectory is None:
+            raise InputError("a plan that got as far as a trajectory", source=folder)
+        world, t, q = plan.world, plan.trajectory.time, plan.trajectory.q
+    if not t[0] <= time <= t[-1]:
+        raise InputError(
+            f"a time from {t[0]:g} to {t[-1]:.2f} s", source="--frame", value=time
+        )
+    row = int(np.searchsorted(t, time + 1e-9, side="right")) - 1
+    path = folder / f"frame-{time:g}.png" if out is None else Path(out)
+    if path.suffix != ".png":
+        raise InputError("a name that ends in .png", source=path)
+    view = view_of(world, _some(q, 60), size[0] / size[1], camera)
+    with Camera(world, size, cutout=transparent) as drawing:
+        draw = drawing.cutout if transparent else drawing.shot
+        picture = draw(q[row], view)
+    with whole_file(path) as draft:
+        picture.save(draft)
+    return path

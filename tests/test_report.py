@@ -1,0 +1,674 @@
+"""The report: what is packed is what was run, what is broken is named, and a browser
+without a network shows all of it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import clamber
+from clamber import cli, io, report, viz
+from clamber.contact import Contact, ContactSequence, Stance
+from clamber.errors import InputError
+from clamber.model import Kinematics
+from clamber.pipeline import Plan
+from clamber.scene import Scene
+from clamber.simulation import Rollout
+
+NASTY = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>"
+
+
+def contact(surface: str, support: str, x: float, y: float, z: float) -> Contact:
+    return Contact(
+        surface=surface,
+        support=support,
+        position=np.array([x, y, z]),
+        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+    )
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    """Standing, then the left hand on a box."""
+    scene = Scene.from_height(0.25)
+    feet = (
+        contact("LFoot", "ground", 0.03, 0.07, 0.0),
+        contact("RFoot", "ground", 0.03, -0.07, 0.0),
+    )
+    both = (*feet, contact("LHand", "box", 0.43, 0.17, 0.25))
+    sequence = ContactSequence(
+        source="made up",
+        subject=None,
+        scene=scene,
+        stances=(Stance(contacts=feet), Stance(contacts=both)),
+        t=np.array([0.0, 1.0, 2.0]),
+    )
+    options = clamber.PlanOptions(speed=1.0)
+    return clamber.plan(sequence, clamber.load_robot("coman"), scene, options=options)
+
+
+@pytest.fixture(scope="module")
+def rollout(plan: Plan) -> Rollout:
+    return clamber.simulate(plan, controller="pid")
+
+
+@pytest.fixture(scope="module")
+def planned(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("planned")
+    io.save_plan(plan, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(
+    plan: Plan, rollout: Rollout, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    io.save_plan(plan, folder)
+    io.save_rollout(plan, rollout, folder)
+    io.save_verdict(clamber.judge(plan, rollout), folder)
+    return folder
+
+
+@pytest.fixture
+def run(whole: Path, tmp_path: Path) -> Path:
+    """A copy to break."""
+    return Path(shutil.copytree(whole, tmp_path / "run"))
+
+
+def record_of(page: str) -> dict[str, Any]:
+    found = re.search(r'id="data">(.*?)</script>', page, re.S)
+    assert found
+    return json.loads(found[1])
+
+
+def unpacked(x: dict[str, Any]) -> np.ndarray:
+    whole = np.frombuffer(base64.b64decode(x["data"]), dtype="<i2")
+    values = whole.reshape(-1, x["columns"]).astype(float) * x["scale"]
+    values[whole.reshape(values.shape) == -32768] = np.nan
+    return values
+
+
+def series(record: dict[str, Any], name: str) -> np.ndarray:
+    return unpacked(record["motion"]["arrays"][name])
+
+
+def times(record: dict[str, Any]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(record["motion"]["times"]), dtype="<f4")
+
+
+# What is packed.
+
+
+def test_packed_numbers_are_off_by_half_a_step_at_most(rng: np.random.Generator):
+    x = rng.normal(size=(50, 4, 2)) * 300
+    x[3, 1, 0], x[4, 0, 1] = np.nan, -np.inf
+    back = unpacked(report.packed(x)).reshape(x.shape)
+    known = np.isfinite(x)
+    assert np.array_equal(np.isnan(back), ~known)
+    step = np.abs(x[known]).max() / 32767
+    assert np.abs(back - x)[known].max() <= 0.5001 * step
+    assert np.isnan(unpacked(report.packed(np.full((3, 1), np.nan)))).all()
+    assert not unpacked(report.packed(np.zeros((3, 2)))).any()
+
+
+def test_no_peak_is_lost_between_samples(rng: np.random.Generator):
+    x = rng.normal(size=(100, 3))
+    rows = np.array([0, 7, 30, 99])
+    peaks = report._peaks(x, rows)
+    for i, (a, b) in enumerate([(0, 7), (7, 30), (30, 99), (99, 100)]):
+        for j in range(3):
+            part = x[a:b, j]
+            assert peaks[i, j] == part[np.abs(part).argmax()]
+
+
+def test_rows_are_even_keep_the_end_and_fit():
+    t = np.arange(1001) * 0.01
+    rows = report._rows(t, 10_000)
+    assert rows[0] == 0
+    assert rows[-1] == 1000
+    assert len(rows) == 251
+    assert len(report._rows(t, 20)) <= 21
+    assert report._rows(t[:1], 20).tolist() == [0]
+
+
+def test_short_gaps_and_touches_are_none(rollout: Rollout):
+    force = np.zeros_like(rollout.contact_force)
+    force[10:60, 0, 2] = 100.0
+    force[30:34, 0, 2] = 0.0  # 40 ms without
+    force[20:40, 1, 2] = 100.0
+    force[50:53, 1, 2] = 100.0  # 30 ms with
+    force[70:80, 2, 2] = 100.0
+    force[90:99, 2, 2] = 100.0  # after 100 ms
+    steady = report.steadily_loaded(replace(rollout, contact_force=force))
+    runs = [viz.runs_of(column) for column in steady.T]
+    assert runs[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
+    assert not any(runs[3:])
+
+
+def test_poses_are_those_of_the_recorded_states(whole: Path, rollout: Rollout):
+    record = report.run_record(whole)
+    motion, t = record["motion"], times(record)
+    poses = series(record, "poses").reshape(len(t), -1, 7)
+    bodies = [m["body"] for m in motion["meshes"]]
+    kin = Kinematics(rollout.world)
+    for k in (0, len(t) // 2, len(t) - 1):
+        row = int(np.argmin(np.abs(rollout.time - t[k])))
+        kin.update(rollout.qpos[row])
+        place = poses[k, :, :3] * motion["reach"]
+        np.testing.assert_allclose(place, kin.data.xpos[bodies], atol=1e-4)
+        np.testing.assert_allclose(poses[k, :, 3:], kin.data.xquat[bodies], atol=1e-4)
+    assert t[-1] == pytest.approx(rollout.time[-1], abs=1e-4)
+
+
+def test_the_ghost_is_the_reference_and_the_error_is_between_them(
+    whole: Path, plan: Plan, rollout: Rollout
+):
+    record = report.run_record(whole)
+    t, error = times(record), series(record, "error")
+    reference = plan.trajectory
+    assert reference is not None
+    for k in (0, len(t) // 3, len(t) - 1):
+        row = int(np.argmin(np.abs(rollout.time - t[k])))
+        q_ref = reference.q[min(row * rollout.stride, len(reference.q) - 1)]
+        off = np.abs(rollout.qpos[row] - q_ref)[plan.world.qadr]
+        base = np.linalg.norm(rollout.qpos[row, :3] - q_ref[:3])
+        wanted = [off.max(), np.sqrt((off**2).mean()), base]
+        np.testing.assert_allclose(error[k], wanted, atol=1e-5)
+    assert not np.allclose(series(record, "ghost"), series(record, "poses"))
+
+
+def test_forces_and_torques_keep_their_units(whole: Path, rollout: Rollout):
+    record = report.run_record(whole)
+    effort = series(record, "effort")
+    world = rollout.world
+    order = [world.model.actuator(n).id for n in world.joints]
+    share = np.abs(rollout.actuator_force[:, order] / world.tau_max).max(axis=0)
+    np.testing.assert_allclose(np.abs(effort).max(axis=0), share, atol=1e-4)
+    force = series(record, "force").reshape(len(effort), -1, 3)
+    assert force[-1].sum(axis=0)[2] == pytest.approx(
+        record["motion"]["weight"], rel=0.02
+    )
+    assert series(record, "size").max() == pytest.approx(
+        np.linalg.norm(rollout.contact_force, axis=2).max(), rel=1e-4
+    )
+
+
+def test_the_last_stability_is_that_of_the_last_keyframe(whole: Path, plan: Plan):
+    record = report.run_record(whole)
+    assert series(record, "margin")[-1, 0] == pytest.approx(
+        plan.keyframes[-1].com_margin, abs=0.015
+    )
+    j = record["motion"]["surfaces"].index("LHand")
+    planned = np.flatnonzero(series(record, "planned")[:, j] > 0)
+    assert np.isfinite(series(record, "ratio")[planned, j]).all()
+    lifted = series(record, "points")[:, 3 * j + 2]
+    assert lifted[-1] == pytest.approx(0.25, abs=0.01)
+
+
+# When keyframes are reached.
+
+
+def test_keyframes_are_reached_when_the_plan_says(plan: Plan, rollout: Rollout):
+    assert plan.trajectory is not None
+    assert report.keyframe_times(plan, rollout) == plan.trajectory.keyframes.tolist()
+    early = replace(rollout, time=rollout.time * 0.5)
+    assert report.keyframe_times(plan, early) == [0.0, None]
+    bare = replace(plan, trajectory=None)
+    assert report.keyframe_times(bare, None) == [0.0, 1.0]
+
+
+def test_keyframes_of_an_adapted_run_are_found_by_their_contacts(
+    plan: Plan, rollout: Rollout
+):
+    first = plan.trajectory
+    assert first is not None
+    wait = 400  # samples that the robot stood still before it began
+
+    def later(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.repeat(x[:1], wait, axis=0), x])
+
+    followed = replace(
+        first,
+        time=np.arange(len(first.time) + wait) * 0.001,
+        q=later(first.q),
+        v=later(first.v),
+        tau=later(first.tau),
+        contact=later(first.contact),
+        keyframes=np.zeros(1),
+    )
+    adapted = replace(rollout, followed=followed, time=rollout.time + 0.4)
+    start, hand = report.keyframe_times(plan, adapted)
+    assert start == pytest.approx(0.0, abs=0.5)
+    assert hand == pytest.approx(first.keyframes[1] + 0.4, abs=0.3)
+    never = replace(followed, contact=np.zeros_like(followed.contact))
+    assert report.keyframe_times(plan, replace(adapted, followed=never)) == [None] * 2
+
+
+# The file.
+
+
+def test_a_report_is_one_small_file_that_fetches_nothing(whole: Path):
+    done = report.write_report(whole)
+    assert done.file == whole / "report.html"
+    assert done.missing == ()
+    text = done.file.read_text()
+    assert len(text) < 3_000_000
+    urls = set(re.findall(r"https?://[^\"' ]*", text))
+    assert urls == {"http://www.w3.org/2000/svg"}  # the name of a format
+    assert "$" not in re.sub(r"<script>.*?</script>", "", text, flags=re.S)
+    again = report.write_report(whole, out=whole / "again.html")
+    assert again.file.read_bytes() == done.file.read_bytes()
+
+
+def test_nothing_in_the_record_can_end_its_element():
+    text = report.embedded({"a": NASTY, "b": [float("nan"), 1.5], NASTY: "\u2028&"})
+    assert not set("<>&") & set(text)
+    assert json.loads(text) == {"a": NASTY, "b": [None, 1.5], NASTY: "\u2028&"}
+    page = report.page([{"title": NASTY, "missing": []}])
+    assert page.count("<script") == 2
+    assert page.count("</script>") == 2
+
+
+def test_two_runs_lie_side_by_side(whole: Path, planned: Path, tmp_path: Path):
+    done = report.write_report(whole, compare=planned, out=tmp_path / "both.html")
+    a, b = record_of(done.file.read_text())["runs"]
+    assert a["reached"] is False  # the hand alone is on the box
+    assert b["reached"] is None
+    assert "title" in a
+    assert done.missing == ("no rollout.npz: the plan has not been run in physics",)
+
+
+def test_a_plan_alone_is_animated_without_forces(planned: Path):
+    record = report.run_record(planned)
+    arrays = record["motion"]["arrays"]
+    assert "force" not in arrays
+    assert arrays["ghost"] is None
+    assert record["motion"]["loads"] is None
+    assert np.isfinite(series(record, "margin")).all()
+    assert record["criteria"] is None
+    assert [k["move"] for k in record["keyframes"]][1] == "LHand on box"
+
+
+def test_a_plan_that_got_no_trajectory_shows_its_keyframes(plan: Plan, tmp_path: Path):
+    io.save_plan(replace(plan, trajectory=None, complete=False), tmp_path)
+    record = report.run_record(tmp_path)
+    assert record["motion"]["stills"]
+    assert times(record).tolist() == [0.0, 1.0]
+    assert [k["time"] for k in record["keyframes"]] == [0.0, 1.0]
+
+
+def test_a_plan_with_other_contacts_says_so(plan: Plan, tmp_path: Path):
+    io.save_plan(replace(plan, instead="hands instead of elbows"), tmp_path)
+    assert report.run_record(tmp_path)["instead"] == "hands instead of elbows"
+    io.save_plan(plan, tmp_path)
+    assert report.run_record(tmp_path)["instead"] == ""
+
+
+def test_the_table_of_stances_has_the_figures_of_the_plan(whole: Path, plan: Plan):
+    rows = report.run_record(whole)["keyframes"]
+    for row, key in zip(rows, plan.keyframes, strict=True):
+        assert row["com_margin"] == pytest.approx(key.com_margin)
+        assert row["margin"] == pytest.approx(key.equilibrium.margin)
+        total = np.sum([c["force"] for c in row["contacts"]], axis=0)
+        np.testing.assert_allclose(total, [0, 0, plan.world.mass * 9.81], atol=0.5)
+        for c, state in zip(row["contacts"], key.contacts, strict=True):
+            assert c["surface"] == state.contact.surface
+            assert c["projected_distance"] == pytest.approx(state.projected_distance)
+
+
+def test_a_fall_and_a_stop_and_what_was_felt_are_told(
+    plan: Plan, rollout: Rollout, tmp_path: Path
+):
+    event = clamber.Event(time=0.5, text="LHand touches 30 mm early")
+    io.save_plan(plan, tmp_path)
+    fallen = replace(rollout, fell=True, stopped="nothing to hold", events=(event,))
+    io.save_rollout(plan, fallen, tmp_path)
+    record = report.run_record(tmp_path)
+    assert record["fell"]
+    assert record["stopped"] == "nothing to hold"
+    assert record["events"] == [{"time": 0.5, "text": "LHand touches 30 mm early"}]
+    assert record["motion"]["felt"] == [0.5]
+    assert [m for m in record["missing"] if m.startswith("verdict.json")]
+
+
+# Broken folders.
+
+
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("plan.json", {"criteria"}),
+        ("scene.xml", {"criteria", "keyframes"}),
+        ("trajectory.npz", {"criteria", "keyframes", "motion"}),
+        ("rollout.npz", {"criteria", "keyframes", "motion"}),
+        ("execution.json", {"criteria", "keyframes", "motion"}),
+        ("verdict.json", {"keyframes", "motion"}),
+        ("timings.json", {"criteria", "keyframes", "motion"}),
+    ],
+)
+@pytest.mark.parametrize("how", ["gone", "cut", "foreign"])
+def test_what_is_broken_is_named_and_the_rest_is_shown(
+    run: Path, name: str, kept: set[str], how: str
+):
+    file = run / name
+    if how == "gone":
+        file.unlink()
+    elif how == "cut":
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    elif name.endswith(".npz"):
+        np.savez(file, time=np.zeros(3), qpos=np.zeros((3, 4)))
+    else:
+        file.write_text('{"hello": "world"}')
+    record = report.run_record(run)
+    if (name, how) != ("rollout.npz", "gone"):  # then it is a plan with a verdict
+        assert any(m.startswith(name) for m in record["missing"]), record["missing"]
+    assert all("\n" not in m for m in record["missing"])
+    shown = {k for k in ("criteria", "keyframes", "motion") if record[k]}
+    assert shown == kept
+    assert len(report.page([record])) > 10_000
+
+
+def test_another_robots_rollout_is_not_mistaken_for_this_ones(run: Path):
+    arrays = dict(np.load(run / "rollout.npz"))
+    arrays["qpos"] = arrays["qpos"][:, :-3]
+    np.savez(run / "rollout.npz", **arrays)
+    record = report.run_record(run)
+    assert record["missing"][0].startswith("rollout.npz: qpos is '")
+    assert record["motion"]["loads"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("plan.json", '"com_margin": ', '"com_margin": "x", "was": '),
+        ("plan.json", '"friction": 0.8', '"friction": "0.8"'),
+        ("verdict.json", '"limit": 1.0', '"limit": "1.0"'),
+        ("execution.json", '"fell": false', '"fell": []'),
+    ],
+)
+def test_a_field_that_does_not_fit_is_named(
+    run: Path, name: str, before: str, after: str
+):
+    text = (run / name).read_text()
+    assert before in text
+    (run / name).write_text(text.replace(before, after, 1))
+    missing = report.run_record(run)["missing"]
+    field = before.split('"')[1]
+    assert [m for m in missing if m.startswith(f"{name}: ") and field in m]
+
+
+def test_a_picture_that_is_none_is_left_out(run: Path):
+    picture = run / "demonstration.png"
+    Image.new("RGB", (8, 8)).save(picture)
+    assert report.run_record(run)["picture"].startswith("data:image/png;base64,")
+    picture.write_bytes(b"<svg onload='alert(1)'>")
+    record = report.run_record(run)
+    assert record["picture"] is None
+    assert record["missing"] == ["demonstration.png expected a whole PNG picture"]
+
+
+@pytest.mark.parametrize("content", [None, "{", '{"version": 1}'])
+def test_a_folder_with_nothing_in_it_is_one_sentence(
+    content: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    if content is not None:
+        (tmp_path / "plan.json").write_text(content)
+    assert cli.main(["report", str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "expected a run folder with plan.json or verdict.json" in err
+    assert "Traceback" not in err
+    with pytest.raises(InputError, match="expected a run folder"):
+        report.write_report(tmp_path / "nowhere")
+
+
+def test_the_command_names_the_file_and_on_stderr_what_is_missing(
+    run: Path, capsys: pytest.CaptureFixture[str]
+):
+    (run / "trajectory.npz").unlink()
+    out = run / "page.html"
+    assert cli.main(["report", str(run), "--out", str(out), "--json"]) == 0
+    said = capsys.readouterr()
+    result = json.loads(said.out)
+    assert result["file"] == str(out)
+    assert [m for m in result["missing"] if m.startswith("trajectory.npz")]
+    assert "clamber: trajectory.npz" in said.err
+    nowhere = str(run / "no" / "page.html")
+    assert cli.main(["report", str(run), "--out", nowhere, "--quiet"]) == 2
+    assert "--out is" in capsys.readouterr().err
+
+
+# In a browser.
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium with a software renderer."""
+    chromium = shutil.which("chromium")
+    playwright = pytest.importorskip("playwright.sync_api")
+    if chromium is None:
+        pytest.skip("no chromium here")
+    with playwright.sync_playwright() as p:
+        made = p.chromium.launch(
+            executable_path=chromium,
+            args=[
+                "--no-sandbox",
+                "--use-gl=angle",
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+            ],
+        )
+        yield made
+        made.close()
+
+
+def opened(browser: Any, file: Path, **options: Any) -> tuple[Any, list[str]]:
+    """The page, without a network, and a list to which its complaints are added."""
+    context = browser.new_context(
+        viewport={"width": 900, "height": 700}, offline=True, **options
+    )
+    page, complaints = context.new_page(), []
+    page.on("console", lambda m: complaints.append(f"{m.type}: {m.text}"))
+    page.on("pageerror", lambda e: complaints.append(str(e)))
+    page.on(
+        "request",
+        lambda r: r.url.startswith(("file:", "data:")) or complaints.append(r.url),
+    )
+    page.goto(file.as_uri())
+    settled(page)
+    settled(page)
+    return page, complaints
+
+
+def until(page: Any, condition: str) -> None:
+    """Wait for an expression; the page's policy forbids that Playwright does."""
+    for _ in range(200):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(50)
+    pytest.fail(f"never: {condition}")
+
+
+def settled(page: Any) -> None:
+    """Two frames later."""
+    page.evaluate(
+        "() => new Promise((r) => requestAnimationFrame("
+        "() => requestAnimationFrame(r)))"
+    )
+
+
+def drawn(page: Any, which: int = 0) -> str:
+    """The pixels of an animation, as a data URL."""
+    settled(page)
+    return page.evaluate(f"SCENES[{which}].canvas.toDataURL()")
+
+
+@pytest.fixture(scope="module")
+def page(browser: Any, whole: Path) -> tuple[Any, list[str]]:
+    done = report.write_report(whole, out=whole / "browser.html")
+    return opened(browser, done.file)
+
+
+def test_the_animation_plays_and_scrubs(page: tuple[Any, list[str]]):
+    p, complaints = page
+    before = drawn(p)
+    p.click("#play")
+    until(p, "state.t > 0.2")
+    p.click("#play")
+    t = p.evaluate("state.t")
+    settled(p)
+    assert p.evaluate("state.t") == t  # it has stopped
+    assert drawn(p) != before
+    p.evaluate("go(0)")
+    assert drawn(p) == before
+    p.fill("input[type=range]", "1")
+    assert p.evaluate("state.t") == 1
+    assert p.inner_text("#clock").startswith("1.00 /")
+    assert complaints == []
+
+
+def test_the_picture_is_turned_zoomed_and_reset(page: tuple[Any, list[str]]):
+    p, _ = page
+    p.evaluate("window.scrollTo(0, 0)")
+    before = drawn(p)
+    p.mouse.move(400, 300)
+    p.mouse.down()
+    p.mouse.move(480, 320)
+    p.mouse.up()
+    turned = drawn(p)
+    assert turned != before
+    distance = p.evaluate("state.camera.distance")
+    p.mouse.wheel(0, -300)
+    assert drawn(p) != turned
+    assert p.evaluate("state.camera.distance") < distance
+    p.dblclick("canvas.view")
+    assert drawn(p) == before
+    p.click("text=top")
+    assert drawn(p) != before
+    p.click("text=corner")
+    assert drawn(p) == before
+
+
+def test_the_planned_posture_is_shown_on_request(page: tuple[Any, list[str]]):
+    p, _ = page
+    p.evaluate("go(END / 2)")
+    before = drawn(p)
+    p.check("#ghost")
+    assert drawn(p) != before
+    p.uncheck("#ghost")
+    assert drawn(p) == before
+
+
+def test_a_click_on_a_stance_jumps_there(page: tuple[Any, list[str]], plan: Plan):
+    p, _ = page
+    assert plan.trajectory is not None
+    p.evaluate("go(0)")
+    p.click("tr[data-stance='1']")
+    assert p.evaluate("state.t") == pytest.approx(plan.trajectory.keyframes[1])
+    p.click("figure.tile >> nth=0")
+    assert p.evaluate("state.t") == 0
+    p.click("#next")
+    assert p.evaluate("EVENTS.includes(state.t)")
+    p.click("#previous")
+    assert p.evaluate("state.t") == 0
+
+
+def test_the_cursors_of_the_plots_follow_the_time(page: tuple[Any, list[str]]):
+    p, _ = page
+    p.evaluate("go(END / 4)")
+    left = p.eval_on_selector_all(".cursor", "all => all.map((c) => c.style.left)")
+    assert len(left) == 9  # the timeline and eight plots
+    assert {round(float(x.rstrip("%"))) for x in left} == {25}
+    chart = p.locator(".plot .chart").first
+    middle = chart.bounding_box()["width"] / 2
+    chart.click(position={"x": middle, "y": 60})
+    assert p.evaluate("state.t / END") == pytest.approx(0.5, abs=0.01)
+
+
+def test_it_prints(page: tuple[Any, list[str]]):
+    p, complaints = page
+    pdf = p.pdf(format="A4")
+    assert pdf.startswith(b"%PDF")
+    assert len(pdf) > 50_000
+    assert complaints == []
+
+
+def test_a_run_that_ended_at_once_opens(
+    browser: Any, plan: Plan, rollout: Rollout, tmp_path: Path
+):
+    io.save_plan(plan, tmp_path)
+    arrays = ("time", "qpos", "qvel", "actuator_force", "contact_force", "unintended")
+    first = {name: getattr(rollout, name)[:1] for name in arrays}
+    io.save_rollout(plan, replace(rollout, **first, fell=True), tmp_path)
+    p, complaints = opened(browser, report.write_report(tmp_path).file)
+    assert "The robot fell" in p.inner_text("header")
+    assert complaints == []
+
+
+def test_names_are_text_and_no_script(browser: Any, run: Path):
+    content = json.loads((run / "plan.json").read_text())
+    content["robot"]["name"] = NASTY
+    content["versions"] = {NASTY: NASTY}
+    (run / "plan.json").write_text(json.dumps(content))
+    execution = json.loads((run / "execution.json").read_text())
+    execution["events"] = [{"time": 0.5, "text": NASTY}]
+    (run / "execution.json").write_text(json.dumps(execution))
+    p, complaints = opened(browser, report.write_report(run).file)
+    assert NASTY in p.title()
+    assert p.inner_text("h1").startswith(NASTY)
+    assert p.locator("img, body script").count() == 2  # the data and our own
+    assert complaints == []
+
+
+def test_the_policy_runs_no_script_but_ours(browser: Any, whole: Path, tmp_path: Path):
+    text = report.page([report.run_record(whole)])
+    file = tmp_path / "page.html"
+    file.write_text(
+        text.replace("</body>", "<script>document.title = 'taken'</script></body>")
+    )
+    p, complaints = opened(browser, file)
+    assert p.title() != "taken"
+    assert any("Content Security Policy" in c for c in complaints)
+
+
+def test_two_runs_play_together(browser: Any, whole: Path, planned: Path):
+    done = report.write_report(whole, compare=planned, out=whole / "two.html")
+    p, complaints = opened(browser, done.file, color_scheme="dark")
+    before = drawn(p, 0), drawn(p, 1)
+    p.evaluate("go(END / 2)")
+    assert drawn(p, 0) != before[0]
+    assert drawn(p, 1) != before[1]
+    assert complaints == []
+
+
+def test_a_phone_sees_all_of_it_without_scrolling_sideways(browser: Any, whole: Path):
+    done = report.write_report(whole, out=whole / "phone.html")
+    p, complaints = opened(browser, done.file, has_touch=True, is_mobile=True)
+    p.set_viewport_size({"width": 390, "height": 844})
+    settled(p)
+    assert p.evaluate("document.documentElement.scrollWidth") <= 390
+    p.tap("#next")
+    assert p.evaluate("state.t") > 0
+    assert complaints == []
+
+
+@pytest.mark.parametrize("lost", ["plan.json", "scene.xml"])
+def test_a_broken_run_opens_and_says_what_is_missing(
+    browser: Any, run: Path, lost: str
+):
+    (run / lost).unlink()
+    p, complaints = opened(browser, report.write_report(run).file)
+    assert lost in p.inner_text(".missing >> nth=0")
+    assert "Nothing to animate" in p.inner_text("main")
+    assert "did not fall" in p.inner_text("main")
+    assert complaints == []
