@@ -229,6 +229,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         paths=(move,),
         skipped=(skipped,),
         complete=True,
+        instead="",
         trajectory="timed",
     )
     event = clamber.Event(time=7.25, text="LHand touches 30 mm below")
@@ -268,6 +269,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         note(name, result)
     for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
         note(name)
+    monkeypatch.setitem(vars(clamber), "plan_or_replan", clamber.plan)
     monkeypatch.setattr(
         cli, "_save_timings", lambda folder, clock: s.timings.update(clock.stages())
     )
