@@ -35,9 +35,7 @@ REACH = 0.12  # [m] a contact is looked for this far from where it was planned
 FEELING_SPEED = 0.06  # [m/s] along the normal
 FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
 FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
-HORIZON = (
-    6  # contact changes that a policy is followed ahead; then it goes on from there
-)
+HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
@@ -269,6 +267,7 @@ def _nodes_below(
     world = ik.world
     support = world.supports[contact.support]
     # Straight down from where the limb is: a round surface has rolled since its plan.
+    ik.kin.update(q)
     p = ik.kin.contact_point(contact.surface, support.normal)
     top = p - support.normal * float((p - contact.position) @ support.normal)
     nodes, depths = [q], [0.0]
