@@ -429,8 +429,13 @@ def _left_of(
     return [rows[i][0] for i in left], [rows[i][1] for i in left]
 
 
-def _descent(task: _Task, platform: Platform) -> list[tuple[Step, str]] | str:
-    """The ascent from behind the far edge with its steps reversed, or why not."""
+def _descent(
+    task: _Task, platform: Platform
+) -> tuple[tuple[Contact, ...], list[tuple[Step, str]]] | str:
+    """The ascent from behind the far edge reversed, or why not.
+
+    Its last stance, from which the descent begins, and the steps from there.
+    """
     edge = platform.exit
     assert edge is not None
     world = task.ik.world
@@ -465,7 +470,7 @@ def _descent(task: _Task, platform: Platform) -> list[tuple[Step, str]] | str:
                 name,
             )
         )
-    return out
+    return found.keyframes[-1].stance, out
 
 
 def _home_ahead(task: _Task) -> np.ndarray:
@@ -481,10 +486,11 @@ def _home_ahead(task: _Task) -> np.ndarray:
 def _climb_down(
     task: _Task, key: Keyframe, platform: Platform
 ) -> tuple[list[_Made], str]:
-    """All that is left of a descent."""
-    there = _descent(task, platform)
-    if isinstance(there, str):
-        return [], there
+    """All that is left of a descent; where that cannot be, contacts move first."""
+    reversed_ascent = _descent(task, platform)
+    if isinstance(reversed_ascent, str):
+        return [], reversed_ascent
+    top, there = reversed_ascent
     robot = task.ik.world.robot
     now = {robot.limb_of(c.surface).name: c.surface for c in key.stance}
     steps, names = [], []
@@ -502,8 +508,28 @@ def _climb_down(
         return [], "nothing is left to climb down with"
     found, _ = search_steps(task.ik, steps, task.options, start=key)
     if found.missed:
-        return [], found.missed[0].reason
+        if any(c.support == GROUND for c in key.stance):
+            return [], found.missed[0].reason
+        return _rearranged(task, key, top), found.missed[0].reason
     return list(zip(found.keyframes[1:], found.paths, names, strict=True)), ""
+
+
+def _rearranged(task: _Task, key: Keyframe, top: tuple[Contact, ...]) -> list[_Made]:
+    """Contacts moved to where the reversed ascent ends: from there is a way down."""
+    body = _fours_frame(task, top)
+    made: list[_Made] = []
+    option = next(o for o in task.policy.options if o.region == "O")
+    for c in top:
+        limb = task.ik.world.robot.limb_of(c.surface).name
+        here = _by_limb(task, key.stance)[limb]
+        if np.linalg.norm(c.position - here.position) < SAME:
+            continue
+        place = Place(support=c.support, position=c.position)
+        found = _attempt(task, key, c.surface, here, place, body, task.fours)
+        if not isinstance(found, str):
+            key, path = found
+            made.append((key, path, option.name))
+    return made
 
 
 # On all fours.
