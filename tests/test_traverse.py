@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ def option(name: str, region, surfaces, until) -> Option:
 
 
 HANDS, ELBOWS = ("LHand", "RHand"), ("LElbow", "RElbow")
+FOURS = (*ELBOWS, "LKnee", "RKnee")
 POLICY = GeneralPolicy(
     options=(
         option("ac1", "M", HANDS, "M"),
@@ -132,6 +134,38 @@ def test_legs_lead_backwards_and_arms_forwards(task):
     lead = module._leading_first
     assert lead(task, cycle, here, back) == ("LKnee", "RKnee", "LElbow", "RElbow")
     assert lead(task, cycle, here, ahead) == cycle.surfaces
+
+
+def test_where_there_is_no_way_down_contacts_move_to_where_there_is(task, monkeypatch):
+    """Only those that are elsewhere, each from the stance that the last one left."""
+    top = tuple(contact(s, 0.8, y) for s, y in zip(FOURS, (0.1, -0.1) * 2, strict=True))
+    off = (0.03, 0.01, 0.04, 0.0)
+    here = tuple(
+        replace(c, position=c.position + np.array([d, 0.0, 0.0]))
+        for c, d in zip(top, off, strict=True)
+    )
+    seen = []
+
+    def attempt(task, key, surface, now, place, body, reference):
+        seen.append((surface, now.position[0], len(key.stance), key.made))
+        if surface == "LKnee" and refused:
+            return "out of reach"
+        moved = tuple(
+            replace(c, position=place.position) if c.surface == surface else c
+            for c in key.stance
+        )
+        return SimpleNamespace(stance=moved, made=key.made + 1), "path"
+
+    monkeypatch.setattr(module, "_attempt", attempt)
+    for refused, moved in ((False, 2), (True, 1)):
+        seen.clear()
+        made = module._rearranged(task, SimpleNamespace(stance=here, made=0), top)
+        assert [s for s, *_ in seen] == ["LElbow", "LKnee"]
+        assert [x for _, x, *_ in seen] == pytest.approx([0.83, 0.84])
+        assert [k for *_, k in seen] == [0, 1]
+        assert len(made) == moved
+        assert made[-1][0].stance[0].position[0] == pytest.approx(0.8)
+        assert {name for *_, name in made} == {"ac3"}
 
 
 def test_the_posture_on_all_fours_rests_on_them_level(task):
