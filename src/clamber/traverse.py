@@ -610,6 +610,7 @@ def _crawl(
         _Frame(0.5 * (frame.xy + full.xy), frame.yaw + 0.5 * (full.yaw - frame.yaw)),
         _Frame(full.xy, frame.yaw),
         _Frame(frame.xy, full.yaw),
+        frame,  # on the spot, as it should stand
     )
     why = ""
     for body in tries:
@@ -632,7 +633,7 @@ def _crawl(
             _cycle(task, now, platform, option, around, others, made)
             left, why = _cycle(task, made[-1][0], platform, option, body, [stuck], made)
             if left:
-                return [], why
+                continue
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
