@@ -63,6 +63,10 @@ REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
 LEAN = np.radians(80.0)  # of the trunk on all fours
+FLUSH = 0.01  # [m] tops that differ by less are no stairs
+# Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets its
+# upper edge before it leans far enough for the weight to get ahead of the other knee.
+BEFORE_RISER = 0.5
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
@@ -387,7 +391,8 @@ def _ascent(task: _Task, edge: Edge, platform: Platform) -> list[tuple[Step, str
             if option.region == "O" and limb.is_arm and limb.name in at:
                 continue
             offset = _climb_offset(task, surface)
-            place = _place(task, platform, surface, _Frame(edge.point, yaw).at(offset))
+            wanted = _Frame(edge.point, yaw).at(offset)
+            place = _place(task, platform, surface, wanted, platform.boxes)
             contact = _contact(world, surface, place, yaw)
             breaks = (at[limb.name],) if limb.name in at else ()
             if not limb.is_arm and not breaks:
@@ -516,6 +521,8 @@ def _on_fours(
     frame = _fours_frame(task, key.stance)
     if platform.exit is None:
         yaw = frame.yaw if task.goal_yaw is None else task.goal_yaw
+        if task.goal_yaw is None and _rises(task, platform):
+            yaw = platform.entry.yaw  # a riser is climbed square to it
         wanted = _Frame(task.goal, yaw)
         if _there(frame, wanted):
             return [], ""
@@ -554,6 +561,12 @@ def _fours_frame(task: _Task, stance: Sequence[Contact]) -> _Frame:
     return _Frame(middle, float(np.arctan2(cross, dot)))
 
 
+def _rises(task: _Task, platform: Platform) -> bool:
+    """There are stairs on it."""
+    tops = [task.ik.world.supports[n].position[2] for n in platform.boxes]
+    return max(tops) - min(tops) > FLUSH
+
+
 def _crawl_step(task: _Task) -> float:
     return min(task.build.step.values())
 
@@ -586,9 +599,24 @@ def _crawl(
         _Frame(frame.xy, full.yaw),
     )
     why = ""
+    leading = _leading_first(task, option, frame, full)
+    if _rises(task, platform):
+        # The second knee over a riser wants the elbows near: knees may have to go first.
+        k = len(leading) // 2
+        for body in tries:
+            for order in (leading, leading[k:] + leading[:k]):
+                made = []
+                left = list(order)
+                for first in (True, False):
+                    now = made[-1][0] if made else key
+                    left, why = _cycle(
+                        task, now, platform, option, body, left, made, first=first
+                    )
+                if made and not left:
+                    return made, ""
     for body in tries:
-        made: list[_Made] = []
-        left = list(_leading_first(task, option, frame, full))
+        made = []
+        left = list(leading)
         # What cannot move yet is tried again once the others have, and then shorter.
         left, why = _cycle(task, key, platform, option, body, left, made, first=True)
         if left:
@@ -603,8 +631,14 @@ def _crawl(
             back = here - _turn(body.yaw) @ task.build.fours[limb]
             others = [s for s in option.surfaces if s != stuck]
             around = _Frame(back, body.yaw)
-            _cycle(task, now, platform, option, around, others, made)
-            left, why = _cycle(task, made[-1][0], platform, option, body, [stuck], made)
+            # Over a riser it may follow before all are back.
+            groups = [[s] for s in others] if _rises(task, platform) else [others]
+            for group in groups:
+                _cycle(task, now, platform, option, around, group, made, back=True)
+                now = made[-1][0]
+                left, why = _cycle(task, now, platform, option, body, [stuck], made)
+                if not left:
+                    break
             if left:
                 return [], why
         if made:
@@ -622,6 +656,7 @@ def _cycle(
     made: list[_Made],
     *,
     first: bool = False,
+    back: bool = False,
 ) -> tuple[list[str], str]:
     """Move some contacts of a cycle; those that cannot be, and why the last of them.
 
@@ -634,12 +669,17 @@ def _cycle(
         surfaces: To move, in order.
         made: Receives what was found.
         first: All the way or not at all, the pelvis as the policy has it.
+        back: Those that climbed a riser stay above it.
     """
     left, why = [], ""
+    tops = {n: task.ik.world.supports[n].position[2] for n in platform.boxes}
     for surface in surfaces:
         limb = task.ik.world.robot.limb_of(surface).name
         here = _by_limb(task, key.stance)[limb]
-        place = _place(task, platform, surface, body.at(task.build.fours[limb]))
+        low = tops[here.support] - FLUSH if back else -math.inf
+        boxes = [n for n in platform.boxes if tops[n] >= low]
+        wanted = body.at(task.build.fours[limb])
+        place = _place(task, platform, surface, wanted, boxes)
         if np.linalg.norm(place.position - here.position) < SAME:
             continue
         found = _attempt(
@@ -762,14 +802,22 @@ def _contact(world: World, surface: str, place: Place, yaw: float) -> Contact:
     )
 
 
-def _place(task: _Task, platform: Platform, surface: str, wanted: np.ndarray) -> Place:
-    """Where on the platform a surface can rest, nearest to `wanted` (2,)."""
+def _place(
+    task: _Task,
+    platform: Platform,
+    surface: str,
+    wanted: np.ndarray,
+    boxes: Sequence[str],
+) -> Place:
+    """Where on some boxes of the platform a surface can rest, nearest to `wanted`."""
     world = task.ik.world
     beside = world.surfaces[surface].radius + CLEAR
-    place = find_place(world.scene, platform.boxes, wanted, beside)
+    if _rises(task, platform) and not world.robot.limb_of(surface).is_arm:
+        beside = max(beside, BEFORE_RISER * task.build.thigh)
+    place = find_place(world.scene, tuple(boxes), wanted, beside)
     if place is not None:
         return place
-    top = world.supports[platform.boxes[0]]
+    top = world.supports[boxes[0]]
     return Place(support=top.name, position=top.project(np.array([*wanted, 0.0])))
 
 
