@@ -51,6 +51,7 @@ from clamber.search import home_at, plan_step, standing
 STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
 TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
+CYCLES = (1.0, 0.5, 0.25)  # a cycle over a riser that fails is tried shorter
 SHRUNK = (1.0, 0.6, 0.3)  # a step that fails is tried shorter
 SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
@@ -64,8 +65,8 @@ REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
 LEAN = np.radians(80.0)  # of the trunk on all fours
 FLUSH = 0.01  # [m] tops that differ by less are no stairs
-# Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets its
-# upper edge before it leans far enough for the weight to get ahead of the other knee.
+# Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
+# its upper edge before it leans far enough for the weight to get past the other knee.
 BEFORE_RISER = 0.5
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
@@ -581,6 +582,11 @@ def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
     return _Frame(a.xy + way / cycles, a.yaw + share)
 
 
+def _share(a: _Frame, b: _Frame, share: float) -> _Frame:
+    """A part of the way from one to the other."""
+    return _Frame(a.xy + share * (b.xy - a.xy), a.yaw + share * (b.yaw - a.yaw))
+
+
 def _crawl(
     task: _Task,
     key: Keyframe,
@@ -594,28 +600,19 @@ def _crawl(
     full = _between(frame, wanted, step, TURN)
     tries = (
         full,
-        _Frame(0.5 * (frame.xy + full.xy), frame.yaw + 0.5 * (full.yaw - frame.yaw)),
+        _share(frame, full, 0.5),
         _Frame(full.xy, frame.yaw),
         _Frame(frame.xy, full.yaw),
     )
     why = ""
     leading = _leading_first(task, option, frame, full)
     if _rises(task, platform):
-        # The second knee over a riser wants the elbows near: knees may have to go first.
-        k = len(leading) // 2
-        for body in tries:
-            for order in (leading, leading[k:] + leading[:k]):
-                made = []
-                left = list(order)
-                for first in (True, False):
-                    now = made[-1][0] if made else key
-                    left, why = _cycle(
-                        task, now, platform, option, body, left, made, first=first
-                    )
-                if made and not left:
-                    return made, ""
+        bodies = [_share(frame, full, x) for x in CYCLES]
+        made = _over_riser(task, key, platform, option, bodies, leading)
+        if made:
+            return made, ""
     for body in tries:
-        made = []
+        made: list[_Made] = []
         left = list(leading)
         # What cannot move yet is tried again once the others have, and then shorter.
         left, why = _cycle(task, key, platform, option, body, left, made, first=True)
@@ -644,6 +641,37 @@ def _crawl(
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
+
+
+def _over_riser(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    bodies: Sequence[_Frame],
+    leading: tuple[str, ...],
+) -> list[_Made]:
+    """One cycle in which every contact gets to where it shall; empty: there is none.
+
+    The second knee over a riser wants the elbows near, so that knees may have to go
+    first; and where the next riser leaves elbows no room, hands bear the trunk higher.
+    """
+    robot = task.ik.world.robot
+    arms = {s: robot.limb_of(s).surfaces[0] for s in leading if robot.limb_of(s).is_arm}
+    k = len(leading) // 2
+    for surfaces in (leading, tuple(arms.get(s, s) for s in leading)):
+        for body in bodies:
+            for order in (surfaces, surfaces[k:] + surfaces[:k]):
+                made: list[_Made] = []
+                left = list(order)
+                for first in (True, False):
+                    now = made[-1][0] if made else key
+                    left, _ = _cycle(
+                        task, now, platform, option, body, left, made, first=first
+                    )
+                if made and not left:
+                    return made
+    return []
 
 
 def _cycle(
@@ -680,7 +708,8 @@ def _cycle(
         boxes = [n for n in platform.boxes if tops[n] >= low]
         wanted = body.at(task.build.fours[limb])
         place = _place(task, platform, surface, wanted, boxes)
-        if np.linalg.norm(place.position - here.position) < SAME:
+        there = np.linalg.norm(place.position - here.position) < SAME
+        if there and surface == here.surface:
             continue
         found = _attempt(
             task,
