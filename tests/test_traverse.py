@@ -66,6 +66,21 @@ def scene(length=0.6, width=0.8, height=0.25, face=0.23, goal=None) -> Scene:
     return Scene(boxes=(box,), start=np.zeros(3), goal=np.array(goal))
 
 
+def stairs(steps: int, rise: float, tread: float) -> Scene:
+    """One behind the other; the goal is the middle of the last."""
+    boxes = tuple(
+        Box(
+            name=f"s{i + 1}",
+            size=np.array([tread, 0.8, rise * (i + 1)]),
+            position=np.array([0.23 + tread * (i + 0.5), 0.0, rise * (i + 1) / 2]),
+            rotation=np.eye(3),
+        )
+        for i in range(steps)
+    )
+    goal = np.array([0.23 + tread * (steps - 0.5), 0.0])
+    return Scene(boxes=boxes, start=np.zeros(3), goal=goal)
+
+
 def contact(surface: str, x: float, y: float, support="table") -> Contact:
     return Contact(
         surface=surface,
@@ -185,6 +200,71 @@ def test_steps_are_a_third_of_a_limb_or_what_was_shown(robot):
     near = module._build(ik, replace(POLICY, reach={"LElbow": 0.1}))
     assert near.step["left_arm"] == pytest.approx(0.3 * far.step["left_arm"])
     assert near.step["right_arm"] == far.step["right_arm"]
+
+
+def test_a_part_of_a_cycle_goes_and_turns_by_that_part():
+    a = module._Frame(np.array([1.0, 2.0]), 0.2)
+    b = module._Frame(np.array([2.0, 0.0]), -0.2)
+    part = module._share(a, b, 0.25)
+    np.testing.assert_allclose([*part.xy, part.yaw], [1.25, 1.5, 0.1])
+
+
+def test_on_stairs_knees_leave_their_thighs_room_before_a_riser(robot):
+    task = module._task(
+        IK(build_world(robot, stairs(3, 0.1, 0.4))), POLICY, PlanOptions()
+    )
+    (platform,) = task.platforms
+    assert module._rises(task, platform)
+
+    def placed(surface, x, boxes=platform.boxes):
+        wanted = np.array([x, 0.1])
+        return module._place(task, platform, surface, wanted, boxes)
+
+    thigh = task.build.thigh
+    riser = 0.63
+    knee, elbow = placed("LKnee", riser - 0.07), placed("LElbow", riser - 0.07)
+    assert (knee.support, elbow.support) == ("s1", "s1")
+    assert knee.position[0] <= riser - module.BEFORE_RISER * thigh
+    assert elbow.position[0] > knee.position[0]
+    assert knee.position[2] == pytest.approx(0.1)
+    # What has climbed a riser is not put down before it again.
+    above = placed("LKnee", riser - 0.07, platform.boxes[1:])
+    assert above.support == "s2"
+    assert riser < above.position[0] < riser + 0.05
+
+
+def test_boxes_of_one_height_are_no_stairs(robot, task):
+    assert not module._rises(task, task.platforms[0])
+    flat = replace(stairs(2, 0.1, 0.4).boxes[0], size=np.array([0.4, 0.8, 0.205]))
+    level = Scene(
+        boxes=(
+            replace(flat, position=np.array([0.43, 0.0, 0.1025])),
+            stairs(2, 0.1, 0.4).boxes[1],
+        ),
+        start=np.zeros(3),
+        goal=np.array([1.0, 0.0]),
+    )
+    same = module._task(IK(build_world(robot, level)), POLICY, PlanOptions())
+    assert len(same.platforms[0].boxes) == 2
+    assert not module._rises(same, same.platforms[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("steps", "rise", "tread"), [(3, 0.1, 0.4), (2, 0.15, 0.4), (3, 0.1, 0.3)]
+)
+def test_stairs_are_climbed_until_all_weight_is_on_the_last(robot, steps, rise, tread):
+    plan = plan_traverse(POLICY, robot, stairs(steps, rise, tread))
+    assert plan.complete, plan.skipped
+    assert {c.support for c in plan.keyframes[-1].stance} == {f"s{steps}"}
+    used = {c.support for k in plan.keyframes for c in k.stance}
+    assert used == {GROUND, *(f"s{i + 1}" for i in range(steps))}
+    kin = Kinematics(plan.world)
+    for path in plan.paths:
+        for phase in path.phases:
+            for q in phase.q:
+                kin.update(q)
+                assert max(contact_drift(kin, c) for c in phase.contacts) < 0.005
 
 
 def test_an_obstacle_beyond_reach_says_how_far_to_walk(robot):

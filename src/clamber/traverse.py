@@ -51,6 +51,7 @@ from clamber.search import home_at, plan_step, standing
 STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
 TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
+CYCLES = (1.0, 0.5, 0.25)  # a cycle over a riser that fails is tried shorter
 SHRUNK = (1.0, 0.6, 0.3)  # a step that fails is tried shorter
 SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
@@ -63,6 +64,10 @@ REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
 LEAN = np.radians(80.0)  # of the trunk on all fours
+FLUSH = 0.01  # [m] tops that differ by less are no stairs
+# Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
+# its upper edge before it leans far enough for the weight to get past the other knee.
+BEFORE_RISER = 0.5
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
@@ -387,7 +392,8 @@ def _ascent(task: _Task, edge: Edge, platform: Platform) -> list[tuple[Step, str
             if option.region == "O" and limb.is_arm and limb.name in at:
                 continue
             offset = _climb_offset(task, surface)
-            place = _place(task, platform, surface, _Frame(edge.point, yaw).at(offset))
+            wanted = _Frame(edge.point, yaw).at(offset)
+            place = _place(task, platform, surface, wanted, platform.boxes)
             contact = _contact(world, surface, place, yaw)
             breaks = (at[limb.name],) if limb.name in at else ()
             if not limb.is_arm and not breaks:
@@ -542,6 +548,8 @@ def _on_fours(
     frame = _fours_frame(task, key.stance)
     if platform.exit is None:
         yaw = frame.yaw if task.goal_yaw is None else task.goal_yaw
+        if task.goal_yaw is None and _rises(task, platform):
+            yaw = platform.entry.yaw  # a riser is climbed square to it
         wanted = _Frame(task.goal, yaw)
         if _there(frame, wanted):
             return [], ""
@@ -580,6 +588,12 @@ def _fours_frame(task: _Task, stance: Sequence[Contact]) -> _Frame:
     return _Frame(middle, float(np.arctan2(cross, dot)))
 
 
+def _rises(task: _Task, platform: Platform) -> bool:
+    """There are stairs on it."""
+    tops = [task.ik.world.supports[n].position[2] for n in platform.boxes]
+    return max(tops) - min(tops) > FLUSH
+
+
 def _crawl_step(task: _Task) -> float:
     return min(task.build.step.values())
 
@@ -592,6 +606,11 @@ def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
     cycles = max(away, turns, 1.0)
     share = angle / cycles if away <= turns + 1.0 or turns == 0 else 0.0
     return _Frame(a.xy + way / cycles, a.yaw + share)
+
+
+def _share(a: _Frame, b: _Frame, share: float) -> _Frame:
+    """A part of the way from one to the other."""
+    return _Frame(a.xy + share * (b.xy - a.xy), a.yaw + share * (b.yaw - a.yaw))
 
 
 def _crawl(
@@ -607,15 +626,21 @@ def _crawl(
     full = _between(frame, wanted, step, TURN)
     tries = (
         full,
-        _Frame(0.5 * (frame.xy + full.xy), frame.yaw + 0.5 * (full.yaw - frame.yaw)),
+        _share(frame, full, 0.5),
         _Frame(full.xy, frame.yaw),
         _Frame(frame.xy, full.yaw),
         frame,  # on the spot, as it should stand
     )
     why = ""
+    leading = _leading_first(task, option, frame, full)
+    if _rises(task, platform):
+        bodies = [_share(frame, full, x) for x in CYCLES]
+        made = _over_riser(task, key, platform, option, bodies, leading)
+        if made:
+            return made, ""
     for body in tries:
         made: list[_Made] = []
-        left = list(_leading_first(task, option, frame, full))
+        left = list(leading)
         # What cannot move yet is tried again once the others have, and then shorter.
         left, why = _cycle(task, key, platform, option, body, left, made, first=True)
         if left:
@@ -630,13 +655,50 @@ def _crawl(
             back = here - _turn(body.yaw) @ task.build.fours[limb]
             others = [s for s in option.surfaces if s != stuck]
             around = _Frame(back, body.yaw)
-            _cycle(task, now, platform, option, around, others, made)
-            left, why = _cycle(task, made[-1][0], platform, option, body, [stuck], made)
+            # Over a riser it may follow before all are back.
+            groups = [[s] for s in others] if _rises(task, platform) else [others]
+            for group in groups:
+                _cycle(task, now, platform, option, around, group, made, back=True)
+                now = made[-1][0]
+                left, why = _cycle(task, now, platform, option, body, [stuck], made)
+                if not left:
+                    break
             if left:
                 continue
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
+
+
+def _over_riser(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    bodies: Sequence[_Frame],
+    leading: tuple[str, ...],
+) -> list[_Made]:
+    """One cycle in which every contact gets to where it shall; empty: there is none.
+
+    The second knee over a riser wants the elbows near, so that knees may have to go
+    first; and where the next riser leaves elbows no room, hands bear the trunk higher.
+    """
+    robot = task.ik.world.robot
+    arms = {s: robot.limb_of(s).surfaces[0] for s in leading if robot.limb_of(s).is_arm}
+    k = len(leading) // 2
+    for surfaces in (leading, tuple(arms.get(s, s) for s in leading)):
+        for body in bodies:
+            for order in (surfaces, surfaces[k:] + surfaces[:k]):
+                made: list[_Made] = []
+                left = list(order)
+                for first in (True, False):
+                    now = made[-1][0] if made else key
+                    left, _ = _cycle(
+                        task, now, platform, option, body, left, made, first=first
+                    )
+                if made and not left:
+                    return made
+    return []
 
 
 def _cycle(
@@ -649,6 +711,7 @@ def _cycle(
     made: list[_Made],
     *,
     first: bool = False,
+    back: bool = False,
 ) -> tuple[list[str], str]:
     """Move some contacts of a cycle; those that cannot be, and why the last of them.
 
@@ -661,13 +724,19 @@ def _cycle(
         surfaces: To move, in order.
         made: Receives what was found.
         first: All the way or not at all, the pelvis as the policy has it.
+        back: Those that climbed a riser stay above it.
     """
     left, why = [], ""
+    tops = {n: task.ik.world.supports[n].position[2] for n in platform.boxes}
     for surface in surfaces:
         limb = task.ik.world.robot.limb_of(surface).name
         here = _by_limb(task, key.stance)[limb]
-        place = _place(task, platform, surface, body.at(task.build.fours[limb]))
-        if np.linalg.norm(place.position - here.position) < SAME:
+        low = tops[here.support] - FLUSH if back else -math.inf
+        boxes = [n for n in platform.boxes if tops[n] >= low]
+        wanted = body.at(task.build.fours[limb])
+        place = _place(task, platform, surface, wanted, boxes)
+        there = np.linalg.norm(place.position - here.position) < SAME
+        if there and surface == here.surface:
             continue
         found = _attempt(
             task,
@@ -789,14 +858,22 @@ def _contact(world: World, surface: str, place: Place, yaw: float) -> Contact:
     )
 
 
-def _place(task: _Task, platform: Platform, surface: str, wanted: np.ndarray) -> Place:
-    """Where on the platform a surface can rest, nearest to `wanted` (2,)."""
+def _place(
+    task: _Task,
+    platform: Platform,
+    surface: str,
+    wanted: np.ndarray,
+    boxes: Sequence[str],
+) -> Place:
+    """Where on some boxes of the platform a surface can rest, nearest to `wanted`."""
     world = task.ik.world
     beside = world.surfaces[surface].radius + CLEAR
-    place = find_place(world.scene, platform.boxes, wanted, beside)
+    if _rises(task, platform) and not world.robot.limb_of(surface).is_arm:
+        beside = max(beside, BEFORE_RISER * task.build.thigh)
+    place = find_place(world.scene, tuple(boxes), wanted, beside)
     if place is not None:
         return place
-    top = world.supports[platform.boxes[0]]
+    top = world.supports[boxes[0]]
     return Place(support=top.name, position=top.project(np.array([*wanted, 0.0])))
 
 
