@@ -15,7 +15,7 @@ import numpy as np
 
 from clamber.errors import InputError
 from clamber.policy import Edge
-from clamber.scene import GROUND, GROUND_HALF_SIZE, Scene, Support
+from clamber.scene import GROUND_HALF_SIZE, Scene, Support
 
 GAP = (
     0.30  # [m] a narrower gap is crawled across; in a wider one there is room to stand
@@ -195,9 +195,3 @@ def _height(top: Support, points: np.ndarray) -> np.ndarray:
     n = top.normal
     off = points - top.position[:2]
     return top.position[2] - off @ n[:2] / n[2]
-
-
-def ground_place(scene: Scene, wanted: np.ndarray) -> Place:
-    """A point of the ground."""
-    assert scene.ground.name == GROUND
-    return Place(support=GROUND, position=np.array([*wanted, 0.0]))

@@ -112,6 +112,7 @@ class _Build:
         step: Of each limb (5.9) [m].
         fours: (2,) offset of each limb's contact from the body's frame, on all fours.
         feet: Half the distance between the feet.
+        ahead: (2,) from the ankles' midpoint to the feet's, in the body's frame.
         stand: From the feet to an edge that is to be climbed [m].
         reach: From the feet to an edge, at most [m].
         tall: Height that hands reach, standing [m].
@@ -121,6 +122,7 @@ class _Build:
     step: dict[str, float]
     fours: dict[str, np.ndarray]
     feet: float
+    ahead: np.ndarray
     stand: float
     reach: float
     tall: float
@@ -356,8 +358,12 @@ def _walk(
 
 def _home(task: _Task, body: _Frame) -> np.ndarray:
     """(nq,) the posture that the robot starts from, over the feet."""
-    ahead = _home_ahead(task)
-    return home_at(task.ik.world, np.array([*body.at(-ahead), body.yaw]))
+    return home_at(task.ik.world, _ankles(task, body))
+
+
+def _ankles(task: _Task, body: _Frame) -> np.ndarray:
+    """(3,) x, y and yaw of the ankles' midpoint where the feet are at the body's."""
+    return np.array([*body.at(-task.build.ahead), body.yaw])
 
 
 # Up and down.
@@ -445,9 +451,7 @@ def _descent(
     edge = platform.exit
     assert edge is not None
     world = task.ik.world
-    frame = _before(task, edge)
-    ahead = _home_ahead(task)
-    at = np.array([*frame.at(-ahead), frame.yaw])
+    at = _ankles(task, _before(task, edge))
     start = standing(task.ik, task.options.keyframe, at)
     rows = _ascent(task, edge, platform)
     steps = [s for s, _ in rows]
@@ -477,16 +481,6 @@ def _descent(
             )
         )
     return found.keyframes[-1].stance, out
-
-
-def _home_ahead(task: _Task) -> np.ndarray:
-    """(2,) from the ankles' midpoint to the feet's, in the body's frame."""
-    world, kin = task.ik.world, task.ik.kin
-    kin.update(world.home)
-    legs = [x.surfaces[0] for x in world.robot.limbs.values() if not x.is_arm]
-    up = np.array([0.0, 0.0, 1.0])
-    feet = np.mean([kin.contact_point(s, up)[:2] for s in legs], axis=0)
-    return _turn(world.scene.start[2]).T @ (feet - world.scene.start[:2])
 
 
 def _climb_down(
@@ -639,13 +633,7 @@ def _crawl(
         if made:
             return made, ""
     for body in tries:
-        made: list[_Made] = []
-        left = list(leading)
-        # What cannot move yet is tried again once the others have, and then shorter.
-        left, why = _cycle(task, key, platform, option, body, left, made, first=True)
-        if left:
-            now = made[-1][0] if made else key
-            left, why = _cycle(task, now, platform, option, body, left, made)
+        made, left, why = _twice(task, key, platform, option, body, leading)
         if left and made:
             # The others have gone too far ahead: around the first that is left behind
             # they stand again as they should, and it may follow.
@@ -689,16 +677,30 @@ def _over_riser(
     for surfaces in (leading, tuple(arms.get(s, s) for s in leading)):
         for body in bodies:
             for order in (surfaces, surfaces[k:] + surfaces[:k]):
-                made: list[_Made] = []
-                left = list(order)
-                for first in (True, False):
-                    now = made[-1][0] if made else key
-                    left, _ = _cycle(
-                        task, now, platform, option, body, left, made, first=first
-                    )
+                made, left, _ = _twice(task, key, platform, option, body, order)
                 if made and not left:
                     return made
     return []
+
+
+def _twice(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    body: _Frame,
+    surfaces: Sequence[str],
+) -> tuple[list[_Made], list[str], str]:
+    """A cycle whose surfaces that cannot move yet are tried again once others have.
+
+    Then shorter too. What was made, which surfaces are left, and why the last of them.
+    """
+    made: list[_Made] = []
+    left, why = _cycle(task, key, platform, option, body, surfaces, made, first=True)
+    if left:
+        now = made[-1][0] if made else key
+        left, why = _cycle(task, now, platform, option, body, left, made)
+    return made, left, why
 
 
 def _cycle(
@@ -983,6 +985,7 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
         step=step,
         fours=fours,
         feet=0.5 * float(np.linalg.norm(soles[0] - soles[1])),
+        ahead=along.T @ (np.mean(soles, axis=0) - world.scene.start[:2]),
         stand=STAND * leg,
         reach=STAND * leg + REACH * arm,
         tall=leg + trunk + arm,
