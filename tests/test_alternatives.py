@@ -216,7 +216,7 @@ def test_a_plan_that_is_complete_is_all_there_is(demo_sequence, coman, monkeypat
     def never(*args, **kwargs):
         raise AssertionError("alternatives are not looked at")
 
-    monkeypatch.setattr(alternatives, "replan", never)
+    monkeypatch.setattr(alternatives, "_replanned", never)
     found = plan_or_replan(demo_sequence, coman, Scene.from_height(0.275))
     assert found.complete
     assert found.instead == ""
@@ -263,6 +263,16 @@ def test_where_nothing_is_found_it_says_what_was_tried(failing, demo_sequence, c
     assert not found.complete
     assert "expanded 1 states and planned 1 steps" in found.instead
     assert Stop.TRIES.value in found.instead
+
+
+def test_contacts_without_alternatives_are_planned_once(failing, demo_sequence, coman):
+    """The only combination is the demonstrated one, which has just failed."""
+    asked = failing("LFoot")
+    bare = alternatives._without(demo_sequence, {"LElbow", "RElbow"})
+    scene = Scene.from_height(0.275)
+    found = plan_or_replan(bare, coman, scene, bounds=Bounds(tries=0))
+    assert found.instead.endswith("there is no alternative")
+    assert len(asked) == 1
 
 
 def test_where_no_alternative_is_stable_the_search_takes_over(

@@ -245,11 +245,31 @@ def replan(
     """
     options = options or PlanOptions()
     report = progress or _silent
+    return _replanned(sequence, robot, scene, options, bounds, counts, report, None)
+
+
+def _replanned(
+    sequence: ContactSequence,
+    robot: Robot,
+    scene: Scene,
+    options: PlanOptions,
+    bounds: Bounds | None,
+    counts: Counts | None,
+    report: Progress,
+    first: Plan | None,
+) -> Replanned:
+    """`replan`; `first` is the plan of the demonstrated contacts, where there is one.
+
+    Where no limb offers several surfaces, the only alternative is that one.
+    """
     planned = []
     candidates = contact_alternatives(sequence, robot)
     for i, a in enumerate(candidates):
         report("replan", i / len(candidates), ", ".join(a.surfaces))
-        planned.append((a, plan(a.sequence, robot, scene, options=options)))
+        made = first if not a.surfaces else None
+        if made is None:
+            made = plan(a.sequence, robot, scene, options=options)
+        planned.append((a, made))
     report("replan", 1.0, "")
     ranked = _ranked(planned)
     explored = None
@@ -343,19 +363,13 @@ def plan_or_replan(
     Raises:
         InputError: The scene does not fit the sequence, or is out of the robot's reach.
     """
-    first = plan(sequence, robot, scene, options=options, progress=progress)
+    options = options or PlanOptions()
+    report = progress or _silent
+    first = plan(sequence, robot, scene, options=options, progress=report)
     why = _why_not(first)
     if first.complete or not why:
         return first
-    found = replan(
-        sequence,
-        robot,
-        scene,
-        options=options,
-        bounds=bounds,
-        counts=counts,
-        progress=progress,
-    )
+    found = _replanned(sequence, robot, scene, options, bounds, counts, report, first)
     if not found.best.stable:
         return replace(first, instead=f"{why}; {described(found)}")
     how = "of the alternatives" if found.explored is None else "found by search"
@@ -429,9 +443,11 @@ def replan_rest(
         timings={},
         midway=now,
     )
+    if first.complete:
+        return first
     ik = IK(world)
     settled = settle(ik, now, now.q, options)
-    if first.complete or isinstance(settled, str):
+    if isinstance(settled, str):
         return first
     why = _why_not(first)
     start, lead = settled
