@@ -475,15 +475,19 @@ def save_sequence(sequence: ContactSequence, path: str | Path) -> None:
     _write_json(Path(path), sequence_fields(sequence))
 
 
+def _file_of(path: str | Path, name: str) -> Path:
+    """The file itself, or that of its name in a folder."""
+    path = Path(path)
+    return path / name if path.is_dir() else path
+
+
 def load_sequence(path: str | Path) -> ContactSequence:
     """Read a `sequence.json`, or that of a run folder.
 
     Raises:
         InputError: The file or one of its fields cannot be used.
     """
-    file = Path(path)
-    if file.is_dir():
-        file = file / SEQUENCE
+    file = _file_of(path, SEQUENCE)
     return _read_json(file, _SequenceFile).sequence(file)
 
 
@@ -618,9 +622,7 @@ def load_policy(path: str | Path) -> GeneralPolicy:
     Raises:
         InputError: The file or one of its fields cannot be used.
     """
-    file = Path(path)
-    if file.is_dir():
-        file = file / POLICY
+    file = _file_of(path, POLICY)
     return _read_json(file, _GeneralFile).policy(file, "")
 
 
