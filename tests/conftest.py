@@ -95,15 +95,9 @@ def fast_plan(demo_plan):
     """The same postures, as fast as joints and contacts bear."""
     from dataclasses import replace
 
-    from clamber.trajectory import build_trajectory
+    from clamber.pipeline import timed
 
-    counts = [len(path.phases) for path in demo_plan.paths]
-    trajectory = build_trajectory(
-        demo_plan.world,
-        [p for path in demo_plan.paths for p in path.phases],
-        speed="max",
-        keyframe_after=(np.cumsum(counts) - 1).tolist(),
-    )
+    trajectory = timed(demo_plan.world, demo_plan.paths, "max")
     options = replace(demo_plan.options, speed="max")
     return replace(demo_plan, options=options, trajectory=trajectory)
 
@@ -113,7 +107,7 @@ def hands_plan(demo_plan):
     """Fast, and no more than the first two steps: both hands on the box."""
     from dataclasses import replace
 
-    from clamber.trajectory import build_trajectory
+    from clamber.pipeline import timed
 
     paths, stances = demo_plan.paths[:2], demo_plan.sequence.stances
     down = [
@@ -121,12 +115,7 @@ def hands_plan(demo_plan):
         for i, stance in enumerate(stances)
         if {"LHand", "RHand"} <= set(stance.surfaces)
     ]
-    trajectory = build_trajectory(
-        demo_plan.world,
-        [p for path in paths for p in path.phases],
-        speed="max",
-        keyframe_after=(np.cumsum([len(path.phases) for path in paths]) - 1).tolist(),
-    )
+    trajectory = timed(demo_plan.world, paths, "max")
     return replace(
         demo_plan,
         options=replace(demo_plan.options, speed="max"),
@@ -157,3 +146,54 @@ def demo_kinematics(demo_plan):
     from clamber.model import Kinematics
 
     return Kinematics(demo_plan.world)
+
+
+# The shortest motion there is, for tests of what is made of a run.
+
+
+def contact(surface: str, support: str, x: float, y: float, z: float):
+    """A contact that lies level and faces x."""
+    from clamber.contact import Contact
+
+    return Contact(
+        surface=surface,
+        support=support,
+        position=np.array([x, y, z]),
+        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+    )
+
+
+@pytest.fixture(scope="session")
+def one_hand():
+    """Standing, then the left hand on a box."""
+    from clamber.contact import ContactSequence, Stance
+    from clamber.scene import Scene
+
+    feet = (
+        contact("LFoot", "ground", 0.03, 0.07, 0.0),
+        contact("RFoot", "ground", 0.03, -0.07, 0.0),
+    )
+    both = (*feet, contact("LHand", "box", 0.43, 0.17, 0.25))
+    return ContactSequence(
+        source="made up",
+        subject=None,
+        scene=Scene.from_height(0.25),
+        stances=(Stance(contacts=feet), Stance(contacts=both)),
+        t=np.array([0.0, 1.0, 2.0]),
+    )
+
+
+@pytest.fixture(scope="session")
+def one_hand_plan(one_hand, coman):
+    """That, planned at 1 rad/s."""
+    from clamber.pipeline import PlanOptions, plan
+
+    return plan(one_hand, coman, one_hand.scene, options=PlanOptions(speed=1.0))
+
+
+@pytest.fixture(scope="session")
+def one_hand_rollout(one_hand_plan):
+    """And followed open loop."""
+    from clamber.simulation import simulate
+
+    return simulate(one_hand_plan, controller="pid")

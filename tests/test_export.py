@@ -17,48 +17,22 @@ from scipy.interpolate import CubicHermiteSpline
 
 import clamber
 from clamber import cli, export, io
-from clamber.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError, MissingDependency
 from clamber.model import Kinematics
 from clamber.pipeline import Plan
-from clamber.scene import Scene
 from clamber.simulation import Rollout
 
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
-def contact(surface: str, support: str, x: float, y: float, z: float) -> Contact:
-    return Contact(
-        surface=surface,
-        support=support,
-        position=np.array([x, y, z]),
-        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
-    )
+@pytest.fixture(scope="module")
+def plan(one_hand_plan: Plan) -> Plan:
+    return one_hand_plan
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
-    """Standing, then the left hand on a box."""
-    scene = Scene.from_height(0.25)
-    feet = (
-        contact("LFoot", "ground", 0.03, 0.07, 0.0),
-        contact("RFoot", "ground", 0.03, -0.07, 0.0),
-    )
-    both = (*feet, contact("LHand", "box", 0.43, 0.17, 0.25))
-    sequence = ContactSequence(
-        source="made up",
-        subject=None,
-        scene=scene,
-        stances=(Stance(contacts=feet), Stance(contacts=both)),
-        t=np.array([0.0, 1.0, 2.0]),
-    )
-    options = clamber.PlanOptions(speed=1.0)
-    return clamber.plan(sequence, clamber.load_robot("coman"), scene, options=options)
-
-
-@pytest.fixture(scope="module")
-def rollout(plan: Plan) -> Rollout:
-    return clamber.simulate(plan, controller="pid")
+def rollout(one_hand_rollout: Rollout) -> Rollout:
+    return one_hand_rollout
 
 
 @pytest.fixture(scope="module")

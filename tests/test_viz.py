@@ -16,42 +16,20 @@ from PIL import Image
 
 import clamber
 from clamber import io, viz
-from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.contact import ContactInterval, ContactSequence, Stance
 from clamber.errors import ClamberError, InputError
-from clamber.model import Kinematics
+from clamber.model import Kinematics, Robot
 from clamber.pipeline import Plan
 from clamber.scene import Box, Scene
 from clamber.simulation import Rollout
+from conftest import contact
 
 SIZE = (160, 120)
 
 
-def contact(surface: str, support: str, x: float, y: float, z: float) -> Contact:
-    return Contact(
-        surface=surface,
-        support=support,
-        position=np.array([x, y, z]),
-        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
-    )
-
-
 @pytest.fixture(scope="module")
-def plan() -> Plan:
-    """Standing, then the left hand on a box."""
-    scene = Scene.from_height(0.25)
-    feet = (
-        contact("LFoot", "ground", 0.03, 0.07, 0.0),
-        contact("RFoot", "ground", 0.03, -0.07, 0.0),
-    )
-    both = (*feet, contact("LHand", "box", 0.43, 0.17, 0.25))
-    sequence = ContactSequence(
-        source="made up",
-        subject=None,
-        scene=scene,
-        stances=(Stance(contacts=feet), Stance(contacts=both)),
-        t=np.array([0.0, 1.0, 2.0]),
-    )
-    return clamber.plan(sequence, clamber.load_robot("coman"), scene)
+def plan(one_hand: ContactSequence, coman: Robot) -> Plan:
+    return clamber.plan(one_hand, coman, one_hand.scene)
 
 
 @pytest.fixture(scope="module")
