@@ -781,7 +781,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "inputs": hashes,
         "robot": robot,
         "prefixes": dict(world.robot.prefixes),
-        "keyframes": [_keyframe_fields(k, kin) for k in plan.keyframes],
+        "keyframes": [keyframe_fields(k, kin) for k in plan.keyframes],
         "moves": [
             {
                 "limb": m.limb,
@@ -845,7 +845,8 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
     }
 
 
-def _keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
+def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
+    """A keyframe by the keys of `plan.json`."""
     kin.update(k.q)
     names, points, _, _ = bearing_frames(kin, k.stance)
     e = k.equilibrium
