@@ -68,7 +68,9 @@ def free_port(host: str, port: int) -> int:
                 probe.bind((host, candidate))
                 return candidate
     raise InputError(
-        f"a free port among it and the {PORTS - 1} after it", source="--port", value=port
+        f"a port that is free, or one of the {PORTS - 1} after it",
+        source="--port",
+        value=port,
     )
 
 
@@ -90,19 +92,19 @@ class Clock:
         """
         self.lock = threading.RLock()
         self.t, self.speed, self.playing = 0.0, 1.0, False
-        self.end, self.events = 0.0, [0.0]
+        self.begin, self.end, self.events = 0.0, 0.0, [0.0]
         self._show = show
 
-    def span(self, end: float, events: Sequence[float]) -> None:
+    def span(self, begin: float, end: float, events: Sequence[float]) -> None:
         """What there is to play [s], and the times to step through."""
         with self.lock:
-            self.end, self.events = end, sorted(events)
-            self.go(min(self.t, end))
+            self.begin, self.end, self.events = begin, end, sorted(events)
+            self.go(self.t)
 
     def go(self, t: float) -> None:
         """Show a time."""
         with self.lock:
-            self.t = min(max(t, 0.0), self.end)
+            self.t = min(max(t, self.begin), self.end)
             self._show(self.t)
 
     def step(self, way: int) -> None:
@@ -114,14 +116,14 @@ class Clock:
                 self.go(later[0] if later else self.end)
             else:
                 earlier = [t for t in self.events if t < self.t - STEP]
-                self.go(earlier[-1] if earlier else 0.0)
+                self.go(earlier[-1] if earlier else self.begin)
 
     def toggle(self) -> None:
         """Play, from the beginning where it is at its end; or pause."""
         with self.lock:
             if not self.playing and self.t >= self.end:
-                self.go(0.0)
-            self.playing = not self.playing and self.end > 0
+                self.go(self.begin)
+            self.playing = not self.playing and self.end > self.begin
 
     def advance(self, seconds: float) -> None:
         """Let so much time pass, where it plays."""
@@ -147,6 +149,7 @@ class Page:
             InputError: There is no such address, or no free port.
         """
         self.wanted = port
+        self.missing: list[str] = []
         port = free_port(host, port)
         with silent():
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -162,7 +165,10 @@ class Page:
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_hemisphere(
-            "/lights/sky", (255, 255, 255), (170, 165, 160), intensity=2.2
+            "/lights/sky",
+            sky_color=(255, 255, 255),
+            ground_color=(170, 165, 160),
+            intensity=2.2,
         )
         scene.add_light_directional(
             "/lights/sun",
@@ -193,7 +199,11 @@ class Page:
         """Where the page is, from this machine."""
         wild = self.host in ("0.0.0.0", "::", "")
         name = "localhost" if wild else self.host
-        return f"http://[{name}]:{self.port}" if ":" in name else f"http://{name}:{self.port}"
+        return (
+            f"http://[{name}]:{self.port}"
+            if ":" in name
+            else f"http://{name}:{self.port}"
+        )
 
     def close(self) -> None:
         """Stop serving."""
@@ -279,10 +289,10 @@ class Page:
 
     # Time.
 
-    def span(self, end: float, events: Sequence[float]) -> None:
-        """What there is to play [s]."""
-        self._slider.max = max(end, 0.01)
-        self.clock.span(end, events)
+    def span(self, begin: float, end: float, events: Sequence[float]) -> None:
+        """What there is to play [s], and the times to step through."""
+        self._slider.min, self._slider.max = begin, max(end, begin + 0.01)
+        self.clock.span(begin, end, events)
 
     def _tell(self, t: float) -> None:
         with self.server.atomic():

@@ -24,7 +24,6 @@ from clamber.motion import (
     stance_rows,
     steadily_loaded,
 )
-from clamber.moves import split_moves
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import CLEARANCE
 from clamber.simulation import Rollout
@@ -38,7 +37,7 @@ from clamber.statics import (
     support_polygon,
     theta_max,
 )
-from clamber.trajectory import RATE
+from clamber.view.edits import keyframe_steps
 from clamber.viz import FORCE_LENGTH, bearing_of, support_below
 
 PLAN_STRIDE = 10  # samples of a trajectory between two states that are shown
@@ -305,7 +304,7 @@ def weight_of(world: World) -> float:
 
 
 def force_arrow(world: World, touch: Touch) -> np.ndarray | None:
-    """(2, 3) tail and tip of a contact's force [m]; None where there is next to none."""
+    """(2, 3) tail and tip of a contact's force [m]; None where there is none."""
     if touch.force is None:
         return None
     share = touch.force / weight_of(world)
@@ -383,18 +382,26 @@ def _ways(plan: Plan) -> tuple[Way, ...]:
             if len(free):
                 a, b = a + int(free[0]), a + int(free[-1]) + 1
             surface, points = world.surfaces[c.surface], []
-            for q in trajectory.q[np.linspace(a, b, WAY_POINTS).round().astype(int)]:
+            for q in trajectory.q[a : b + 1 : PLAN_STRIDE]:
                 kin.update(q)
                 points.append(kin.point(surface.body, surface.centre))
             ways.append(
                 Way(
                     stance=i,
                     surface=c.surface,
-                    points=np.array(points),
+                    points=_even(np.array(points)),
                     radius=surface.radius + CLEARANCE,
                 )
             )
     return tuple(ways)
+
+
+def _even(points: np.ndarray) -> np.ndarray:
+    """(n, 3) points evenly spaced along a line (m, 3)."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    at = np.linspace(0.0, length[-1], WAY_POINTS)
+    return np.stack([np.interp(at, length, x) for x in points.T], axis=1)
 
 
 def way_at(shown: Shown, t: float) -> Way | None:
@@ -415,7 +422,7 @@ def tube(points: np.ndarray, radius: float, sides: int = 12) -> tuple[np.ndarray
     keep = np.append(True, np.linalg.norm(steps, axis=1) > 1e-6)
     points = points[keep]
     if len(points) < 2:
-        points = np.concatenate([points, points + [0.0, 0.0, 1e-4]])
+        points = np.concatenate([points, points + np.array([0.0, 0.0, 1e-4])])
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     # Half a ball at either end: rings that shrink along the first and last direction.
@@ -446,25 +453,13 @@ def person_times(shown: Shown) -> tuple[np.ndarray, np.ndarray]:
 
     Between them the one clock is the other one, stretched [s].
     """
-    sequence, keys = shown.plan.sequence, shown.plan.keyframes
-    steps = split_moves(sequence, shown.plan.world)[0]
-    robot, person = [0.0], [float(sequence.t[0])]
-    k = 0
-    for i in range(1, len(keys)):
-        before = {c.surface for c in keys[i - 1].stance}
-        made = [c.surface for c in keys[i].stance if c.surface not in before]
-        for j in range(k, len(steps)):
-            makes = steps[j].move.makes
-            if (makes.surface if makes is not None else None) in (made or [None]):
-                k = j + 1
-                t = shown.reached[i]
-                if t is not None and t > robot[-1]:
-                    robot.append(t)
-                    person.append(float(sequence.t[steps[j].stance]))
-                break
+    robot, person = [0.0], [float(shown.plan.sequence.t[0])]
+    for i, step in keyframe_steps(shown.plan):
+        t = shown.reached[i]
+        if t is not None and t > robot[-1]:
+            robot.append(t)
+            person.append(float(shown.plan.sequence.t[step.stance]))
     if shown.duration > robot[-1]:
         robot.append(shown.duration)
-        person.append(float(sequence.t[-1]))
+        person.append(float(shown.plan.sequence.t[-1]))
     return np.array(robot), np.array(person)
-
-

@@ -17,7 +17,6 @@ import viser
 
 from clamber.meshes import Mesh
 from clamber.model import World
-from clamber.scene import GROUND
 from clamber.se3 import (
     frame_from_normal,
     matrix_from_quat,
@@ -25,6 +24,7 @@ from clamber.se3 import (
     quat_from_matrix,
     quat_multiply,
 )
+from clamber.view.person import Figure, Person
 from clamber.view.shown import Frame, Shown, Touch, force_arrow, tube, way_at
 from clamber.viz import PHASE_COLOURS
 
@@ -32,19 +32,24 @@ GHOST = (59, 130, 246)
 PUSH = (162, 28, 175)
 BALANCE, ELLIPSE, COM = (37, 99, 235), (8, 145, 178), (217, 70, 239)
 WAY = (124, 58, 237)
-BOX_EDGE = (92, 70, 48)
-DISC, DISC_HEIGHT, LIFT = 0.035, 0.004, 0.002  # [m]
+PERSON, PERSON_BOX = (71, 105, 150), (203, 188, 165)
+BONE, JOINT, HEAD = 0.022, 0.03, 0.1  # [m] radii
+MOST_PARTS = 16  # of a person that are in contact at once
+DISC, DISC_HEIGHT, LIFT = 0.055, 0.004, 0.002  # [m]
 CONE_HEIGHT = 0.14  # [m]
 SIDES = 24
+SEE_THROUGH = 0.6  # opacity of the robot around contacts and forces
 HIDDEN = 1e-4  # scale of a part of a node that is not there
+RECORDING = "recording"
 LAYERS = {  # name in the page: shown at first
     "planned posture": True,
+    "see-through robot": False,
     "contacts": True,
     "forces": True,
     "friction cones": False,
     "balance": True,
     "way of the limb": True,
-    "recording": False,
+    RECORDING: False,
 }
 
 
@@ -76,6 +81,7 @@ class Links:
         names: list[str] = []
         parents: list[int] = []
         self._nodes: list[Any] = []
+        self._meshes: list[Any] = []
         for m in own:
             parent = int(world.model.body_parentid[m.body])
             while parent and parent not in index:
@@ -84,8 +90,13 @@ class Links:
             above = names[parents[-1]] if parents[-1] >= 0 else root
             names.append(f"{above}/{m.body}")
             self._nodes.append(server.scene.add_frame(names[-1], show_axes=False))
-            add_mesh(server, f"{names[-1]}/mesh", m, ghost=ghost)
+            self._meshes += add_mesh(server, f"{names[-1]}/mesh", m, ghost=ghost)
         self._parents = np.array(parents, dtype=int)
+
+    def see_through(self, on: bool) -> None:
+        """Whether what is inside of them and behind is to be seen."""
+        for mesh in self._meshes:
+            mesh.opacity = SEE_THROUGH if on else None
 
     def pose(self, poses: np.ndarray) -> None:
         """Put the bodies where they are.
@@ -105,22 +116,25 @@ class Links:
 
 def add_mesh(
     server: viser.ViserServer, name: str, mesh: Mesh, *, ghost: bool = False
-) -> None:
+) -> list[Any]:
     """One node for each colour of a mesh."""
+    nodes = []
     corners = mesh.colours[mesh.triangles[:, 0]]
     colours, which = np.unique(corners.round(3), axis=0, return_inverse=True)
     for i, colour in enumerate(colours):
         faces = mesh.triangles[which.ravel() == i]
         used, at = np.unique(faces, return_inverse=True)
-        server.scene.add_mesh_simple(
+        node = server.scene.add_mesh_simple(
             f"{name}/{i}",
             mesh.vertices[used],
             at.reshape(-1, 3),
-            color=GHOST if ghost else tuple(int(round(255 * c)) for c in colour),
+            color=GHOST if ghost else np.round(255 * colour).astype(np.uint8),
             opacity=0.28 if ghost else None,
             cast_shadow=not ghost,
             receive_shadow=not ghost,
         )
+        nodes.append(node)
+    return nodes
 
 
 def _cylinder(radius: float, height: float, top: float) -> tuple[np.ndarray, ...]:
@@ -128,7 +142,8 @@ def _cylinder(radius: float, height: float, top: float) -> tuple[np.ndarray, ...
     a = np.linspace(0.0, 2 * np.pi, SIDES, endpoint=False)
     ring = radius * np.stack([np.cos(a), np.sin(a), 0.0 * a], axis=1)
     up = np.array([0.0, 0.0, height])
-    vertices = np.concatenate([ring, ring * [top, top, 1.0] + up, [[0, 0, 0], up]])
+    upper = ring * np.array([top, top, 1.0]) + up
+    vertices = np.concatenate([ring, upper, np.zeros((1, 3)), up[None]])
     i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
     low, high = np.full(SIDES, 2 * SIDES), np.full(SIDES, 2 * SIDES + 1)
     faces = np.concatenate(
@@ -243,13 +258,14 @@ class Balance:
 
     def show(self, frame: Frame) -> None:
         """Draw those of a frame, to the millimetre: what has not moved is not sent."""
+        lift = np.array([0.0, 0.0, LIFT])
         polygon, ellipse = frame.polygon.round(3), frame.ellipse.round(3)
         drop = np.stack([frame.foot, frame.com]).round(3)
         rings = [(polygon, BALANCE), (ellipse, ELLIPSE)]
         segments, colours = [drop[None]], [np.tile(COM, (1, 2, 1))]
         for ring, colour in rings:
             if len(ring) > 1:
-                ring = ring + [0.0, 0.0, 2 * LIFT]
+                ring = ring + 2 * lift
                 segments.append(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
                 colours.append(np.tile(colour, (len(ring), 2, 1)))
         points, shades = np.concatenate(segments), np.concatenate(colours)
@@ -259,10 +275,10 @@ class Balance:
         self._area.visible = len(polygon) > 2
         if len(polygon) > 2:
             fan = np.arange(1, len(polygon) - 1)
-            faces = np.stack([0 * fan, fan, fan + 1], axis=1)
+            faces = np.stack([0 * fan, fan, fan + 1], axis=1).astype(np.uint32)
             if len(polygon) != len(self._area.vertices):
                 self._area.faces = faces
-            self._area.vertices = polygon + [0.0, 0.0, LIFT]
+            self._area.vertices = polygon + lift
         self._com.position, self._foot.position = drop[1], drop[0]
 
 
@@ -319,10 +335,13 @@ class Stage:
             add.add_line_segments(f"{name}/line", line, WAY, thickness=0.008)
             self._ways.append(node)
         self._layers: dict[str, bool] = dict(LAYERS)
+        self._robot.see_through(LAYERS["see-through robot"])
 
     def layer(self, name: str, shown: bool) -> None:
         """Show or hide one of `LAYERS`; what it holds follows with the next frame."""
         self._layers[name] = shown
+        if name == "see-through robot":
+            self._robot.see_through(shown)
 
     def show(self, frame: Frame) -> None:
         """Send what differs from the last frame."""
@@ -362,3 +381,72 @@ class Stage:
                 self._arrows.colors = np.array(colours, dtype=np.uint8)
             self._arrows.points = np.array(arrows)
             self._arrows.colors = np.array(colours, dtype=np.uint8)
+
+
+class Stick:
+    """A person as bones and joints, among its boxes, with its contacts."""
+
+    def __init__(self, server: viser.ViserServer, person: Person, root: str) -> None:
+        """Send boxes, a bone and a joint.
+
+        Args:
+            server: Whose scene.
+            person: The recording.
+            root: Name of the node that all hang in.
+        """
+        add = server.scene
+        self._person = person
+        self.root = add.add_frame(root, show_axes=False)
+        for i, box in enumerate(person.demo.scene.boxes):
+            add.add_box(
+                f"{root}/box{i}",
+                color=PERSON_BOX,
+                dimensions=tuple(box.size),
+                wxyz=quat_from_matrix(box.rotation),
+                position=box.position + person.offset,
+            )
+        count, joints = len(person.bones), len(person.joints)
+        vertices, faces = _cylinder(BONE, 1.0, 1.0)
+        common: dict[str, Any] = {"lod": "off", "cast_shadow": True}
+        self._bones = add.add_batched_meshes_simple(
+            f"{root}/bones",
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            np.zeros((count, 3)),
+            batched_scales=np.ones((count, 3)),
+            batched_colors=PERSON,
+            **common,
+        )
+        ball, triangles = tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2e-6]]), JOINT)
+        size = np.ones(joints)
+        if "Head" in person.demo.names:
+            size[-1] = HEAD / JOINT
+        self._joints = add.add_batched_meshes_simple(
+            f"{root}/joints",
+            ball,
+            triangles,
+            np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)),
+            np.zeros((joints, 3)),
+            batched_scales=size,
+            batched_colors=PERSON,
+            **common,
+        )
+        self._discs = Discs(server, f"{root}/contacts", MOST_PARTS)
+
+    def show(self, figure: Figure) -> None:
+        """Put the person where it is; bones that were not seen are not shown."""
+        a, way = figure.bones[:, 0], figure.bones[:, 1] - figure.bones[:, 0]
+        length = np.linalg.norm(way, axis=1)
+        self._bones.batched_positions = a
+        self._bones.batched_wxyzs = np.array(
+            [
+                quat_from_matrix(frame_from_normal(d / max(l, 1e-9), [1.0, 0.0, 0.0]))
+                for d, l in zip(way, length, strict=True)
+            ]
+        )
+        scale = np.stack([np.ones_like(length)] * 2 + [length], axis=1)
+        scale[~figure.seen] = HIDDEN
+        self._bones.batched_scales = scale
+        self._joints.batched_positions = figure.joints
+        self._discs.show(figure.touches)
