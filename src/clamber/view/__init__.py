@@ -20,7 +20,6 @@ from clamber.motion import Reading, read_run
 from clamber.scene import Scene
 from clamber.view.shown import show_run
 
-HOST, PORT = "127.0.0.1", 8080
 BUILT_IN_SOURCE = "built-in "  # what the source of a built-in recording begins with
 
 
@@ -29,8 +28,8 @@ def open_view(
     *,
     demo: str | Path | None = None,
     scene: Scene | None = None,
-    host: str = HOST,
-    port: int = PORT,
+    host: str = "127.0.0.1",
+    port: int = 8080,
 ) -> Any:
     """Serve a run or a recording as a page in the browser.
 

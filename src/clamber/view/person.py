@@ -133,7 +133,7 @@ def figure_at(person: Person, t: float) -> Figure:
 def beside(
     scene: Scene, points: np.ndarray, other: Scene, person: np.ndarray
 ) -> np.ndarray:
-    """(3,) the way from the person's world to a place to the left of the robot's.
+    """(3,) the way from the person's world to a place to the right of the robot's.
 
     The two start abreast; between the boxes, and all that moves, there is a gap.
 
@@ -144,13 +144,13 @@ def beside(
         person: (m, 3) where the person is [m].
     """
     yaw = float(scene.start[2])
-    left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    here = np.concatenate([points, _corners(scene)]) @ left
-    there = np.concatenate([person, _corners(other)]) @ left
+    right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])  # cameras stand to the left
+    here = np.concatenate([points, _corners(scene)]) @ right
+    there = np.concatenate([person, _corners(other)]) @ right
     start = np.array([*scene.start[:2], 0.0])
     ahead = start - np.array([*other.start[:2], 0.0])
-    ahead -= (ahead @ left) * left
-    return ahead + (float(here.max()) - float(there.min()) + GAP) * left
+    ahead -= (ahead @ right) * right
+    return ahead + (float(here.max()) - float(there.min()) + GAP) * right
 
 
 def _corners(scene: Scene) -> np.ndarray:

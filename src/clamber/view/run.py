@@ -53,11 +53,9 @@ def run_page(
     page.missing = run.missing
     world = shown.world
     points = seen_points(Kinematics(world), shown.q)
-    fovy = float(world.model.vis.global_.fovy)
-    page.look(views_of(points, float(world.scene.start[2]), fovy))
     notes = (run.written.get("instead", ""), run.execution.get("stopped", ""))
     page.server.gui.add_html(charts.notes(run.missing, *notes))
-    _RunView(page, run, shown, _beside(shown, points, recorded))
+    _RunView(page, run, shown, points, _beside(shown, points, recorded))
     return page
 
 
@@ -77,16 +75,24 @@ class _RunView:
     """What the page shows at present: the run, or what editing has made of it."""
 
     def __init__(
-        self, page: Page, run: Run, shown: Shown, person: Person | None
+        self,
+        page: Page,
+        run: Run,
+        shown: Shown,
+        points: np.ndarray,
+        person: Person | None,
     ) -> None:
         self._page, self._run, self._first = page, run, shown
+        self._points = points
         self._layers = dict(LAYERS)
         self._count = 0
+        self._shown = shown
         self._stick = None
         self._person = person
         if person is not None:
             self._stick = Stick(page.server, person, "/person")
             self._stick.root.visible = self._layers[RECORDING]
+        self._look()
         self._put(shown)
         self._panel(shown)
         page.watch(self._show)
@@ -102,6 +108,16 @@ class _RunView:
         for name, on in self._layers.items():
             self._stage.layer(name, on)
         self._times = person_times(shown)
+
+    def _look(self) -> None:
+        """Have the cameras take in the robot, and the person where it is shown."""
+        points = self._points
+        if self._person is not None and self._layers[RECORDING]:
+            person = self._person.position[:: len(self._person.position) // 60 + 1]
+            points = np.concatenate([points, person.reshape(-1, 3)])
+        world = self._shown.world
+        fovy = float(world.model.vis.global_.fovy)
+        self._page.look(views_of(points, float(world.scene.start[2]), fovy))
 
     def _show(self, t: float) -> None:
         frame = frame_at(self._shown, self._kin, t)
@@ -138,12 +154,16 @@ class _RunView:
         box = self._page.server.gui.add_checkbox(name, self._layers[name])
 
         @box.on_update
-        def _(_: Any) -> None:
+        def _(event: Any) -> None:
             clock = self._page.clock
             with clock.lock:
                 self._layers[name] = bool(box.value)
                 self._stage.layer(name, bool(box.value))
                 clock.go(clock.t)
+            if name == RECORDING:
+                self._look()
+                if event.client is not None:
+                    self._page.point(event.client, "corner")
 
     def _fill(self, shown: Shown, verdict: Any) -> None:
         """Tables and plots."""

@@ -44,7 +44,8 @@ PLAN_STRIDE = 10  # samples of a trajectory between two states that are shown
 ELLIPSE_POINTS = 48
 WAY_POINTS = 24  # of a limb's way
 AT_REST = 0.15  # [s] around a keyframe its forces are shown where physics has not run
-PUSH_SCALE = 4.0  # arrows of pushes are so much longer than those of contact forces
+ARROW = 2 * FORCE_LENGTH  # [m] of the robot's weight: out of the limb it begins in
+PUSH_SCALE = 2.0  # arrows of pushes are so much longer than those of contact forces
 LEAST_FORCE = 0.005  # [weights] smaller forces are no arrow
 MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
 
@@ -310,7 +311,7 @@ def force_arrow(world: World, touch: Touch) -> np.ndarray | None:
     share = touch.force / weight_of(world)
     if np.linalg.norm(share) < LEAST_FORCE:
         return None
-    return np.stack([touch.position, touch.position + FORCE_LENGTH * share])
+    return np.stack([touch.position, touch.position + ARROW * share])
 
 
 def _static_forces(shown: Shown, t: float, stance: int) -> Mapping[str, np.ndarray]:
@@ -341,7 +342,7 @@ def _push(shown: Shown, kin: Kinematics, row: int) -> np.ndarray | None:
     if np.linalg.norm(share) < LEAST_FORCE:
         return None
     base = kin.data.xpos[shown.world.base]
-    return np.stack([base - PUSH_SCALE * FORCE_LENGTH * share, base])
+    return np.stack([base - PUSH_SCALE * ARROW * share, base])
 
 
 def _at_height(points: np.ndarray, z: float) -> np.ndarray:
