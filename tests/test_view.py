@@ -17,7 +17,7 @@ import pytest
 
 import clamber
 from clamber import cli, io
-from clamber.errors import InputError, MissingDependency
+from clamber.errors import MissingDependency
 from clamber.model import Kinematics
 from clamber.pipeline import Plan
 from clamber.scene import Scene
@@ -92,7 +92,7 @@ def test_forces_sum_to_the_weight_at_rest(ran: Shown, planned: Shown):
 
 
 def test_an_arrow_points_along_its_force_and_grows_with_it(ran: Shown):
-    frame = frame_at(ran, Kinematics(ran.world), 0.0)
+    frame = frame_at(ran, Kinematics(ran.world), ran.duration)
     touch = next(x for x in frame.touches if x.force is not None)
     one, two = (
         force_arrow(ran.world, replace(touch, force=k * np.array([0.0, 0.0, 100.0])))
@@ -121,7 +121,7 @@ def test_poses_are_those_of_physics_and_the_ghost_is_the_plan(ran: Shown):
 
 
 def test_the_centre_of_mass_is_inside_polygon_and_margin(ran: Shown):
-    frame = frame_at(ran, Kinematics(ran.world), 0.0)
+    frame = frame_at(ran, Kinematics(ran.world), ran.duration)
     assert frame.margin > 0
     side = np.roll(frame.polygon, -1, axis=0) - frame.polygon
     gap = frame.foot - frame.polygon
@@ -215,7 +215,7 @@ def test_beside_leaves_a_gap_between_the_boxes():
 def test_a_contact_that_is_moved_is_planned_where_it_was_put(one_hand_plan: Plan):
     spells = edits.spells_of(one_hand_plan)
     assert [s.contact.surface for s in spells] == ["LHand"]
-    place = spells[0].planned + [0.04, 0.03, 0.1]
+    place = spells[0].planned + np.array([0.04, 0.03, 0.1])
     again = edits.plan_edited(one_hand_plan, edits.Edits(moved={0: place}))
     assert again.complete
     hand = next(c for c in again.keyframes[1].stance if c.surface == "LHand")
