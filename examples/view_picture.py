@@ -30,6 +30,7 @@ def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> N
         tab.set_default_timeout(120_000)
         tab.goto(page.url)
         tab.wait_for_selector("text=go to", state="attached")
+        tab.add_style_tag(content=".mantine-Notification-root {display: none}")
         tab.wait_for_timeout(3000)
         if width > 600:
             tab.get_by_role("tab", name="Show").click()
