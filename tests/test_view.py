@@ -369,9 +369,10 @@ def browser() -> Iterator[Any]:
         made.close()
 
 
-def opened(browser: Any, url: str) -> tuple[Any, list[str]]:
+def opened(browser: Any, url: str, **options: Any) -> tuple[Any, list[str]]:
     """The page in a small window, and its complaints; no other address answers."""
-    context = browser.new_context(viewport={"width": 760, "height": 480})
+    options = {"viewport": {"width": 760, "height": 480}, **options}
+    context = browser.new_context(**options)
     tab, complaints = context.new_page(), []
     tab.set_default_timeout(40_000)
     tab.on("pageerror", lambda e: complaints.append(str(e)))
@@ -392,7 +393,6 @@ def opened(browser: Any, url: str) -> tuple[Any, list[str]]:
     return tab, complaints
 
 
-@pytest.mark.slow
 def test_a_run_is_played_jumped_in_edited_and_saved(
     browser: Any, whole: Path, tmp_path: Path
 ):
@@ -430,6 +430,23 @@ def test_a_run_is_played_jumped_in_edited_and_saved(
         assert hand.surface == "LHand"
         np.testing.assert_allclose(hand.position[:2], place[:2], atol=0.005)
         assert {p.name for p in run.iterdir()} - before == {"edited"}
+        assert complaints == []
+    finally:
+        page.close()
+
+
+def test_a_recording_is_shown_dark_and_on_a_phone(browser: Any):
+    page = open_view("climb", port=18095)
+    try:
+        size = {"width": 390, "height": 780}
+        tab, complaints = opened(
+            browser, page.url, viewport=size, color_scheme="dark", has_touch=True
+        )
+        tab.wait_for_selector("[data-mantine-color-scheme=dark]", state="attached")
+        assert tab.evaluate("document.documentElement.scrollWidth") <= 390
+        tab.locator("tbody[data-stance='3']").dispatch_event("click")
+        start = clamber.detect_contacts(clamber.load_demo("climb")).t[3]
+        until(tab, lambda: abs(page.clock.t - start) < 0.01)
         assert complaints == []
     finally:
         page.close()
