@@ -827,7 +827,7 @@ class ViewCommand:
         """Serve until Ctrl-C."""
         from clamber.view import open_view
 
-        place = {"host": self.host, "port": self.port}
+        place: dict[str, Any] = {"host": self.host, "port": self.port}
         page = open_view(
             self.source,
             demo=self.demo,

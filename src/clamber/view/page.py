@@ -28,6 +28,7 @@ PORTS = 50  # tried, one after the other
 PANEL_WIDTH = 400  # [px]
 ASPECT = 1.2  # of the picture beside the panel
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
+SHEET = 0.17  # of the distance that what is seen is moved up, over a panel below
 GROUND_SIZE = 12.0  # [m]
 PLAY, PAUSE = "play", "pause"
 BACK, ON = "< contact", "contact >"
@@ -156,6 +157,7 @@ class Page:
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.host, self.port = host, self.server.get_port()
         self.clock = Clock(self._tell)
+        self._views: dict[Preset, View] = {}
         self._watchers: list[Callable[[float], None]] = []
         self._stopped = threading.Event()
         gui, scene = self.server.gui, self.server.scene
@@ -270,6 +272,8 @@ class Page:
         """What each browser has of its own: its theme."""
         dark = client.gui.add_checkbox("dark", False, order=1e9)
         client.gui.add_html(DARK_FIRST, order=1e9 + 1)
+        if self._views and client.camera.image_width < client.camera.image_height:
+            self.point(client, "corner")
 
         @dark.on_update
         def _(_: Any) -> None:
@@ -289,9 +293,13 @@ class Page:
     def point(self, client: viser.ClientHandle, preset: Preset) -> None:
         """Take a browser's camera to a preset."""
         view = self._views[preset]
+        eye, at, camera = eye_of(view), view.lookat, client.camera
+        if camera.image_width < camera.image_height:  # upright, the panel below
+            eye = at + (eye - at) * ASPECT * camera.image_height / camera.image_width
+            drop = SHEET * float(np.linalg.norm(eye - at)) * view.axes[1]
+            eye, at = eye - drop, at - drop
         with client.atomic():
-            client.camera.position = eye_of(view)
-            client.camera.look_at = view.lookat
+            camera.position, camera.look_at = eye, at
 
     # Time.
 
