@@ -45,7 +45,7 @@ lint: $(VENV)/.has-dev ## ruff: rules and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-type: $(VENV)/.has-video $(VENV)/.has-test $(VENV)/.has-dev ## pyright on src
+type: $(VENV)/.has-view $(VENV)/.has-video $(VENV)/.has-test $(VENV)/.has-dev ## pyright on src
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same jobs in other libraries

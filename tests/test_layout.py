@@ -65,9 +65,10 @@ LAYERS = [
     "viz",
     "curves",
     "policy_plots",
-    "view",
     "meshes",
+    "motion",
     "report",
+    "view",
     "",  # the package itself: its public names
     "cli",
 ]

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 import clamber
-from clamber import cli, io, report, viz
+from clamber import cli, io, motion, report, viz
 from clamber.errors import InputError
 from clamber.model import Kinematics
 from clamber.pipeline import Plan
@@ -99,7 +99,7 @@ def test_packed_numbers_are_off_by_half_a_step_at_most(rng: np.random.Generator)
 def test_no_peak_is_lost_between_samples(rng: np.random.Generator):
     x = rng.normal(size=(100, 3))
     rows = np.array([0, 7, 30, 99])
-    peaks = report._peaks(x, rows)
+    peaks = motion.peaks(x, rows)
     for i, (a, b) in enumerate([(0, 7), (7, 30), (30, 99), (99, 100)]):
         for j in range(3):
             part = x[a:b, j]
@@ -108,12 +108,12 @@ def test_no_peak_is_lost_between_samples(rng: np.random.Generator):
 
 def test_rows_are_even_keep_the_end_and_fit():
     t = np.arange(1001) * 0.01
-    rows = report._rows(t, 10_000)
+    rows = motion.even_rows(t, 10_000)
     assert rows[0] == 0
     assert rows[-1] == 1000
     assert len(rows) == 251
-    assert len(report._rows(t, 20)) <= 21
-    assert report._rows(t[:1], 20).tolist() == [0]
+    assert len(motion.even_rows(t, 20)) <= 21
+    assert motion.even_rows(t[:1], 20).tolist() == [0]
 
 
 def test_short_gaps_and_touches_are_none(rollout: Rollout):
@@ -124,7 +124,7 @@ def test_short_gaps_and_touches_are_none(rollout: Rollout):
     force[50:53, 1, 2] = 100.0  # 30 ms with
     force[70:80, 2, 2] = 100.0
     force[90:99, 2, 2] = 100.0  # after 100 ms
-    steady = report.steadily_loaded(replace(rollout, contact_force=force))
+    steady = motion.steadily_loaded(replace(rollout, contact_force=force))
     runs = [viz.runs_of(column) for column in steady.T]
     assert runs[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
     assert not any(runs[3:])
@@ -195,11 +195,11 @@ def test_the_last_stability_is_that_of_the_last_keyframe(whole: Path, plan: Plan
 
 def test_keyframes_are_reached_when_the_plan_says(plan: Plan, rollout: Rollout):
     assert plan.trajectory is not None
-    assert report.keyframe_times(plan, rollout) == plan.trajectory.keyframes.tolist()
+    assert motion.keyframe_times(plan, rollout) == plan.trajectory.keyframes.tolist()
     early = replace(rollout, time=rollout.time * 0.5)
-    assert report.keyframe_times(plan, early) == [0.0, None]
+    assert motion.keyframe_times(plan, early) == [0.0, None]
     bare = replace(plan, trajectory=None)
-    assert report.keyframe_times(bare, None) == [0.0, 1.0]
+    assert motion.keyframe_times(bare, None) == [0.0, 1.0]
 
 
 def test_keyframes_of_an_adapted_run_are_found_by_their_contacts(
@@ -222,11 +222,11 @@ def test_keyframes_of_an_adapted_run_are_found_by_their_contacts(
         keyframes=np.zeros(1),
     )
     adapted = replace(rollout, followed=followed, time=rollout.time + 0.4)
-    start, hand = report.keyframe_times(plan, adapted)
+    start, hand = motion.keyframe_times(plan, adapted)
     assert start == pytest.approx(0.0, abs=0.5)
     assert hand == pytest.approx(first.keyframes[1] + 0.4, abs=0.3)
     never = replace(followed, contact=np.zeros_like(followed.contact))
-    assert report.keyframe_times(plan, replace(adapted, followed=never)) == [None] * 2
+    assert motion.keyframe_times(plan, replace(adapted, followed=never)) == [None] * 2
 
 
 # The file.
@@ -266,7 +266,7 @@ def test_two_runs_lie_side_by_side(whole: Path, planned: Path, tmp_path: Path):
 def test_a_plan_alone_is_animated_without_forces(planned: Path):
     record = report.run_record(planned)
     arrays = record["motion"]["arrays"]
-    assert "force" not in arrays
+    assert arrays["force"] is None
     assert arrays["ghost"] is None
     assert record["motion"]["loads"] is None
     assert np.isfinite(series(record, "margin")).all()

@@ -73,6 +73,7 @@ _HOME = {
     "load_spec": "experiment",
     "load_sweep": "sweep",
     "midway_of": "alternatives",
+    "open_view": "view",
     "new_run_folder": "io",
     "pelvis_distribution": "policy",
     "plan": "pipeline",

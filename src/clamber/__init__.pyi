@@ -68,6 +68,7 @@ from clamber.sweep import load_sweep as load_sweep
 from clamber.sweep import run_sweep as run_sweep
 from clamber.trajectory import Trajectory as Trajectory
 from clamber.traverse import plan_traverse as plan_traverse
+from clamber.view import open_view as open_view
 from clamber.viz import draw_robot as draw_robot
 from clamber.viz import draw_scene as draw_scene
 from clamber.viz import render_run as render_run

@@ -18,7 +18,7 @@ same order: as it was, with other surfaces, by the search.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,11 +139,15 @@ def contact_alternatives(
     out = []
     for chosen in itertools.product(*offers):
         dropped = {s for names in offers for s in names} - set(chosen)
-        out.append(Alternative(surfaces=chosen, sequence=_without(sequence, dropped)))
+        out.append(
+            Alternative(surfaces=chosen, sequence=without_surfaces(sequence, dropped))
+        )
     return tuple(out)
 
 
-def _without(sequence: ContactSequence, surfaces: set[str]) -> ContactSequence:
+def without_surfaces(
+    sequence: ContactSequence, surfaces: Collection[str]
+) -> ContactSequence:
     """The sequence without the contacts of some surfaces."""
     return replace(
         sequence,

@@ -15,6 +15,7 @@ import io as text_io
 import json
 import math
 import re
+import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -795,6 +796,72 @@ class ReportCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ViewCommand:
+    """Look at a run or a recording in the browser, step through it, edit a plan."""
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|RECORDING")]
+    """A run folder, whole or not; a recording, or a built-in demonstration by name."""
+    demo: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="RECORDING|NAME", help_behavior_hint="(default: the run's own)"
+        ),
+    ] = None
+    """The recording that is shown beside a run."""
+    scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The scene.yaml of a recording that has none."""
+    host: Annotated[
+        str | None,
+        tyro.conf.arg(
+            metavar="ADDRESS", help_behavior_hint="(default: this machine alone)"
+        ),
+    ] = None
+    """Address to listen on; 0.0.0.0: every one of this machine."""
+    port: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 8080)")
+    ] = None
+    """Port, or the next one that is free."""
+    output: Printed
+
+    def run(self) -> int:
+        """Serve until Ctrl-C."""
+        from clamber.view import open_view
+
+        place: dict[str, Any] = {"host": self.host, "port": self.port}
+        page = open_view(
+            self.source,
+            demo=self.demo,
+            scene=None if self.scene is None else clamber.load_scene(self.scene),
+            **{k: v for k, v in place.items() if v is not None},
+        )
+        try:
+            self._say(page)
+            while True:
+                time.sleep(3600.0)
+        except KeyboardInterrupt:
+            return REACHED
+        finally:
+            page.close()
+
+    def _say(self, page: Any) -> None:
+        """Where the page is, and what it cannot show."""
+        if not self.output.quiet:
+            for text in page.missing:
+                sys.stderr.write(f"clamber: {text}\n")
+        lines = [f"the page is at {page.url} (Ctrl-C ends it)"]
+        if page.port != page.wanted:
+            lines.insert(0, f"port {page.wanted} is in use: {page.port} instead")
+        if page.host == "127.0.0.1":
+            lines.append(
+                f"from another machine: ssh -L {page.port}:127.0.0.1:{page.port}"
+                f" {socket.gethostname()}, then the same address there"
+            )
+        record = {"url": page.url, "port": page.port, "missing": page.missing}
+        self.output.show(record, note="\n".join(lines))
+        sys.stdout.flush()
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExportCommand:
     """Write the motion of a run for other tools: CSV, MCAP (ROS 2), npz (trainers)."""
 
@@ -1061,6 +1128,7 @@ Command = (
     | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
     | Annotated[RenderCommand, tyro.conf.subcommand("render")]
     | Annotated[ReportCommand, tyro.conf.subcommand("report")]
+    | Annotated[ViewCommand, tyro.conf.subcommand("view")]
     | Annotated[ExportCommand, tyro.conf.subcommand("export")]
     | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
     | Annotated[RobotCommand, tyro.conf.subcommand("robot")]

@@ -41,9 +41,10 @@ class Contact:
         edge: A flat surface rolled onto one of its four edges: the edge's index, and
             `position` is the middle of that edge. None while it lies flat.
         link: (4,) orientation of a round surface's link in the world where it touches
-        at
-            `position`; as the link turns, the surface rolls from there. None where the
-            contact is not a robot's posture yet.
+            at `position`; as the link turns, the surface rolls from there. None where
+            the contact is not a robot's posture yet.
+        firm: A person put it there: the position is no reference but where it is to be
+            planned, or as near as can be reached.
     """
 
     surface: str
@@ -52,6 +53,7 @@ class Contact:
     quaternion: np.ndarray
     edge: int | None = None
     link: np.ndarray | None = None
+    firm: bool = False
 
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""

@@ -114,7 +114,7 @@ def new_run_folder(out: Path | None, command: str) -> Path:
             folder = Path(out)
             folder.mkdir(parents=True, exist_ok=True)
         else:
-            folder = _next_free(Path("runs"), command)
+            folder = next_free_folder(Path("runs"), command)
         with _whole(folder / ".writable"):
             pass
         (folder / ".writable").unlink()
@@ -127,7 +127,8 @@ def new_run_folder(out: Path | None, command: str) -> Path:
     return folder
 
 
-def _next_free(parent: Path, command: str) -> Path:
+def next_free_folder(parent: Path, command: str) -> Path:
+    """Make `command` in a folder, or the first of `-2`, `-3` ... that is free."""
     parent.mkdir(parents=True, exist_ok=True)
     n = 1
     while True:
@@ -347,6 +348,7 @@ class _ContactFile(pydantic.BaseModel):
     quaternion: Quaternion
     edge: int | None = None
     link: Quaternion | None = None
+    firm: bool = False
 
     def contact(self) -> Contact:
         return Contact(
@@ -356,11 +358,12 @@ class _ContactFile(pydantic.BaseModel):
             quaternion=np.array(self.quaternion),
             edge=self.edge,
             link=None if self.link is None else np.array(self.link),
+            firm=self.firm,
         )
 
 
 def contact_fields(c: Contact) -> dict[str, Any]:
-    """A contact by the keys of `sequence.json`; `edge` and `link` where it has them."""
+    """A contact by the keys of `sequence.json`; `edge`, `link`, `firm` where it is."""
     out: dict[str, Any] = {
         "surface": c.surface,
         "support": c.support,
@@ -368,7 +371,9 @@ def contact_fields(c: Contact) -> dict[str, Any]:
         "quaternion": c.quaternion,
     }
     return out | {
-        k: v for k, v in (("edge", c.edge), ("link", c.link)) if v is not None
+        k: v
+        for k, v in (("edge", c.edge), ("link", c.link), ("firm", c.firm or None))
+        if v is not None
     }
 
 
@@ -781,7 +786,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "inputs": hashes,
         "robot": robot,
         "prefixes": dict(world.robot.prefixes),
-        "keyframes": [_keyframe_fields(k, kin) for k in plan.keyframes],
+        "keyframes": [keyframe_fields(k, kin) for k in plan.keyframes],
         "moves": [
             {
                 "limb": m.limb,
@@ -845,7 +850,8 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
     }
 
 
-def _keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
+def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
+    """A keyframe by the keys of `plan.json`."""
     kin.update(k.q)
     names, points, _, _ = bearing_frames(kin, k.stance)
     e = k.equilibrium

@@ -128,7 +128,8 @@ def split_moves(
                 breaks = (down,) if down is not None else ()
             closed[limb.name] = makes
             standing.discard(limb.name)
-            move = Move(limb=limb.name, breaks=breaks, makes=makes)
+            firm = makes is not None and makes.firm
+            move = Move(limb=limb.name, breaks=breaks, makes=makes, firm=firm)
             steps.append(Step(stance=i, target=stance, move=move))
         if len(steps) == before:
             reason = "; ".join(reasons) or "no limb makes or leaves a bearing contact"

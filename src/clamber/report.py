@@ -21,60 +21,39 @@ import io as bytes_io
 import json
 import math
 import string
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from importlib.resources import files
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import mujoco
 import numpy as np
 from PIL import Image
 
-from clamber.contact import Contact
-from clamber.errors import ClamberError, InputError
-from clamber.io import (
-    EXECUTION,
-    PLAN,
-    ROLLOUT,
-    SCENE,
-    TIMINGS,
-    TRAJECTORY,
-    VERDICT,
-    load_fields,
-    load_plan,
-    load_rollout,
-    whole_file,
-)
+from clamber.errors import InputError
+from clamber.io import PLAN, VERDICT, whole_file
 from clamber.meshes import Mesh, body_meshes
-from clamber.model import Kinematics, World
+from clamber.model import Kinematics
+from clamber.motion import (
+    Reading,
+    keyframe_times,
+    read_run,
+    sample_motion,
+    seen_points,
+    stance_rows,
+)
 from clamber.pipeline import Plan
 from clamber.simulation import Rollout
-from clamber.trajectory import Trajectory
-from clamber.viz import (
-    FORCE_LENGTH,
-    PRESETS,
-    describe_move,
-    loaded_surfaces,
-    near_edge_points,
-    robot_corners,
-    runs_of,
-    stability_of,
-    support_below,
-)
+from clamber.viz import FORCE_LENGTH, PRESETS
 
 REPORT = "report.html"
 PERSON = "demonstration.png"  # of the recording, which is not in the folder
 MAX_PICTURE = 1_000_000  # [bytes] larger ones are left out
-SAMPLES_A_SECOND = 25
 MAX_POSES = (
     1_200_000  # [bytes] of one run's poses; longer runs are sampled more coarsely
 )
-SAME_POSTURE = 1e-3  # [rad]
-SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
 SHARP = 32767  # the largest packed number; one below the smallest stands for none
-_Loaded = TypeVar("_Loaded")
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -171,95 +150,48 @@ def _finite(x: Any) -> Any:
 # What a folder holds.
 
 
-@dataclass(eq=False, slots=True)
-class _Reading:
-    """Reads what can be read of a folder and keeps why the rest could not."""
-
-    folder: Path
-    missing: list[str] = field(default_factory=list)
-
-    def attempt(self, load: Callable[[], _Loaded]) -> _Loaded | None:
-        try:
-            return load()
-        except ClamberError as e:
-            text = str(e).replace(f"{self.folder}/", "")
-            if text not in self.missing:
-                self.missing.append(text)
-            return None
-
-    def fields(self, name: str) -> dict[str, Any]:
-        return self.attempt(lambda: load_fields(self.folder, name)) or {}
-
-    def has(self, name: str) -> bool:
-        return (self.folder / name).exists()
-
-
 def run_record(folder: Path) -> dict[str, Any]:
     """All that the page shows of a run, as plain values.
 
     Raises:
         InputError: It is no folder, or nothing in it can be read.
     """
-    if not folder.is_dir():
-        raise InputError("a run folder", source=folder)
-    reading = _Reading(folder)
-    written = reading.fields(PLAN)
-    ran = reading.has(ROLLOUT)
-    plan, rollout = None, None
-    if written:
-        plan = reading.attempt(lambda: load_plan(folder, without=(TIMINGS,)))
-        if plan is None and reading.has(SCENE):
-            plan = reading.attempt(
-                lambda: load_plan(folder, without=(TIMINGS, TRAJECTORY))
-            )
-        if ran:
-            rollout = reading.attempt(lambda: load_rollout(folder))
-            if rollout is None and plan is not None:
-                rollout = reading.attempt(
-                    lambda: load_rollout(folder, with_events=False)
-                )
-    elif ran:
-        reading.missing.append(f"{ROLLOUT} is not shown: that takes a whole {PLAN}")
-    execution = reading.fields(EXECUTION) if ran or reading.has(EXECUTION) else {}
-    verdict = reading.fields(VERDICT) if ran or reading.has(VERDICT) else {}
-    timings = reading.fields(TIMINGS)
+    run = read_run(folder)
+    written, plan, rollout = run.written, run.plan, run.rollout
+    reading = Reading(folder, run.missing)
     picture = reading.attempt(lambda: _picture(folder / PERSON))
-    if not (written or verdict or execution or picture):
+    if not (written or run.verdict or run.execution or picture):
         raise InputError(
-            f"a run folder with {PLAN} or {VERDICT} ({'; '.join(reading.missing)})",
+            f"a run folder with {PLAN} or {VERDICT} ({'; '.join(run.missing)})",
             source=folder,
         )
-    if written and not ran and not verdict:
-        reading.missing.append(f"no {ROLLOUT}: the plan has not been run in physics")
     motion = None
-    if plan is not None:
-        motion = _motion(plan, rollout, execution)
     times: list[float | None] = [None] * len(written.get("keyframes", []))
     if plan is not None:
+        motion = _motion(plan, rollout, run.execution)
         times = keyframe_times(plan, rollout)
     name = written.get("robot", {}).get("name")
-    world = None if plan is None else plan.world
     place = folder.resolve().name
     return {
         "title": f"{name}: {place}" if name else place,
         "facts": _facts(written),
-        "mass": None if world is None else world.mass,
-        "missing": reading.missing,
-        "reached": verdict.get("reached"),
-        "criteria": _criteria(verdict),
-        "events": execution.get("events", []),
-        "stopped": execution.get("stopped", ""),
-        "fell": execution.get("fell", False),
+        "mass": None if plan is None else plan.world.mass,
+        "missing": run.missing,
+        "reached": run.verdict.get("reached"),
+        "criteria": _criteria(run.verdict),
+        "events": run.execution.get("events", []),
+        "stopped": run.execution.get("stopped", ""),
+        "fell": run.execution.get("fell", False),
         "adapted": rollout is not None
         and rollout.followed is not None
         and bool(rollout.events),
         "instead": written.get("instead", ""),
-        "keyframes": _keyframes(written, times),
+        "keyframes": stance_rows(written, times),
         "skipped": written.get("skipped", []),
         "options": _flat(written.get("options")),
         "versions": _flat(written.get("versions")),
         "inputs": _flat(written.get("inputs")),
-        "timings": [(k, round(v, 3)) for k, v in _flat(timings.get("seconds"))],
+        "timings": [(k, round(v, 3)) for k, v in _flat(run.timings.get("seconds"))],
         "picture": picture,
         "motion": motion,
     }
@@ -308,100 +240,6 @@ def _picture(path: Path) -> str | None:
     return f"data:image/png;base64,{base64.b64encode(content).decode()}"
 
 
-def _keyframes(
-    written: Mapping[str, Any], times: list[float | None]
-) -> list[dict[str, Any]]:
-    """Rows of the table of stances."""
-    rows, before = [], None
-    for key, time in zip(written.get("keyframes", []), times, strict=True):
-        stance = [
-            Contact(
-                surface=c["surface"],
-                support=c["support"],
-                position=np.array(c["position"]),
-                quaternion=np.array(c["quaternion"]),
-            )
-            for c in key["contacts"]
-        ]
-        on = ", ".join(c.surface for c in stance)
-        move = f"start, on {on}" if before is None else describe_move(before, stance)
-        before = stance
-        e = key["static_equilibrium"]
-        force = _force_by_surface(e)
-        rows.append(
-            {
-                "move": move,
-                "time": time,
-                "com_margin": key["com_margin"],
-                "margin": e["margin"],
-                "limiting": e["limiting"],
-                "contacts": [
-                    {
-                        "surface": c["surface"],
-                        "support": c["support"],
-                        "position": c["position"],
-                        "projected_distance": c["projected_distance"],
-                        "contact_angle": c["contact_angle"],
-                        "phase": c["phase"],
-                        "force": force.get(c["surface"]),
-                    }
-                    for c in key["contacts"]
-                ],
-            }
-        )
-    return rows
-
-
-def _force_by_surface(equilibrium: Mapping[str, Any]) -> dict[str, list[float]]:
-    """[N] of each surface over its bearing points; empty where they are not named."""
-    names, forces = equilibrium.get("surfaces"), equilibrium["forces"]
-    if not isinstance(names, list) or len(names) != len(forces):
-        return {}
-    total: dict[str, np.ndarray] = {}
-    for name, force in zip(names, forces, strict=True):
-        total[str(name)] = total.get(str(name), np.zeros(3)) + np.array(force)
-    return {n: f.tolist() for n, f in total.items()}
-
-
-def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
-    """When each keyframe is reached [s]; None where the run never gets there.
-
-    A plan that was adapted has times of its own: there a keyframe is looked for among
-    the spells with its contacts, each after the one before, and is where the reference
-    is nearest to its posture, for the last time.
-    """
-    if plan.trajectory is None:
-        if rollout is None:  # the keyframes alone, a second each
-            return [float(i) for i in range(len(plan.keyframes))]
-        return [None] * len(plan.keyframes)
-    followed = None if rollout is None else rollout.followed
-    end = math.inf if rollout is None else float(rollout.time[-1]) + 0.02
-    if followed is None:
-        known = [float(t) for t in plan.trajectory.keyframes]
-        known += [math.inf] * (len(plan.keyframes) - len(known))
-        return [t if t <= end else None for t in known[: len(plan.keyframes)]]
-    changes = np.flatnonzero(np.any(np.diff(followed.contact, axis=0), axis=1)) + 1
-    spells = list(pairwise([0, *changes.tolist(), len(followed.time)]))
-    times: list[float | None] = []
-    first = 0
-    joints = plan.world.qadr
-    for key in plan.keyframes:
-        wanted = {c.surface for c in key.stance}
-        found = None
-        for k in range(first, len(spells)):
-            a, b = spells[k]
-            row = followed.contact[a]
-            now = {s for s, x in zip(followed.surfaces, row, strict=True) if x}
-            if now == wanted and followed.time[a] <= end:
-                gap = np.abs(followed.q[a:b, joints] - key.q[joints]).max(axis=1)
-                near = np.flatnonzero(gap <= gap.min() + SAME_POSTURE)
-                last = near[-1] if times else 0  # the run begins with the first one
-                found, first = min(float(followed.time[a + last]), end), k + 1
-                break
-        times.append(found)
-    return times
-
-
 # The motion, sampled and packed.
 
 
@@ -411,45 +249,27 @@ def _motion(
     """What is animated and plotted of a run."""
     world = plan.world if rollout is None else rollout.world
     meshes = body_meshes(world.model)
-    reference = plan.trajectory
-    if rollout is not None:
-        reference = rollout.followed or reference
-    stills = rollout is None and reference is None
-    fits = max(2, MAX_POSES // (28 * max(len(meshes), 1)))
-    series: dict[str, np.ndarray | None]
-    if rollout is not None:
-        rows = _rows(rollout.time, fits)
-        time, q = rollout.time[rows], rollout.qpos[rows]
-        series = _physics(rollout, reference, rows)
-    elif reference is not None:
-        rows = _rows(reference.time, fits)
-        time, q = reference.time[rows], reference.q[rows]
-        series = {"planned": reference.contact[rows].astype(float)}
-    else:
-        time = np.arange(len(plan.keyframes), dtype=float)
-        q = np.array([k.q for k in plan.keyframes])
-        held = [{c.surface for c in k.stance} for k in plan.keyframes]
-        series = {"planned": np.array([[s in h for s in world.surfaces] for h in held])}
+    most = max(2, MAX_POSES // (28 * max(len(meshes), 1)))
+    m = sample_motion(plan, rollout, execution, most)
+    series: dict[str, np.ndarray | None] = {
+        "loaded": m.loaded,
+        "force": m.force,
+        "size": m.size,
+        "effort": m.effort,
+        "planned": m.planned,
+        "push": m.push,
+        "pushSize": m.push_size,
+        "base": None if m.push is None else m.q[:, :3],
+        "points": m.points,
+        "support": m.support,
+        "ratio": m.ratio,
+        "margin": m.margin,
+        "plannedMargin": m.planned_margin,
+        "error": m.error,
+    }
     kin = Kinematics(world)
-    q_ref = series.pop("reference", None)
-    series |= _where(world, kin, q)
-    planned, bears = series["planned"], series.get("loaded")
-    bears = planned if bears is None else bears
-    assert bears is not None
-    marked = bears > 0 if planned is None else (bears > 0) | (planned > 0)
-    d, limit, margin = stability_of(world, q, marked, tuple(world.surfaces))
-    other = np.any(marked != (bears > 0), axis=1)  # what bears nothing holds no CoM
-    margin[other] = stability_of(
-        world, q[other], bears[other] > 0, tuple(world.surfaces)
-    )[2]
-    series["ratio"], series["margin"] = d / limit, margin
-    if q_ref is not None and planned is not None:
-        series["plannedMargin"] = stability_of(
-            world, q_ref, planned > 0, tuple(world.surfaces)
-        )[2]
-        series |= _errors(world, q, q_ref)
-    poses = _poses(kin, meshes, q)
-    ghost = None if q_ref is None else _poses(kin, meshes, q_ref)
+    poses = _poses(kin, meshes, m.q)
+    ghost = None if m.reference is None else _poses(kin, meshes, m.reference)
     keyposes = _poses(kin, meshes, np.array([k.q for k in plan.keyframes]))
     shown = [x for x in (poses, ghost, keyposes) if x is not None]
     reach = max(1e-3, *(float(np.abs(x[..., :3]).max()) for x in shown))
@@ -458,20 +278,13 @@ def _motion(
     arrays = {n: None if x is None else packed(x) for n, x in series.items()}
     for name, x in (("poses", poses), ("ghost", ghost), ("keyposes", keyposes)):
         arrays[name] = None if x is None else packed(x, largest=1.0)
-    end = float(time[-1])
-    schedule = [] if reference is None else _spells(reference.time, reference.contact)
-    loads = None
-    if rollout is not None:
-        loads = _spells(rollout.time, steadily_loaded(rollout))
-    schedule = [[(a, min(b, end)) for a, b in x if a < end] for x in schedule]
-    switches = {t for x in loads or schedule for pair in x for t in pair}
     return {
-        "stills": stills,
-        "times": _base64(time, "<f4"),
+        "stills": m.stills,
+        "times": _base64(m.time, "<f4"),
         "arrays": arrays,
-        "meshes": [_mesh_record(m) for m in meshes],
+        "meshes": [_mesh_record(x) for x in meshes],
         "edges": _box_edges(world.model),
-        "seen": _seen(world, kin, q),
+        "seen": seen_points(kin, m.q),
         "start": float(world.scene.start[2]),
         "reach": reach,
         "weight": world.mass * 9.81,
@@ -485,75 +298,11 @@ def _motion(
         "joints": list(world.joints),
         "effortLimits": world.tau_max,
         "marginAsked": plan.options.keyframe.balance_margin,
-        "schedule": schedule or [[] for _ in world.surfaces],
-        "loads": loads,
-        "events": sorted({round(t, 3) for t in switches if SHORTEST_LOAD < t < end}),
-        "felt": [e["time"] for e in execution.get("events", []) if e["time"] <= end],
+        "schedule": m.schedule,
+        "loads": m.loads,
+        "events": m.events,
+        "felt": m.felt,
     }
-
-
-def _rows(time: np.ndarray, fits: int) -> np.ndarray:
-    """Indices of samples, evenly spaced, the last one among them."""
-    duration = float(time[-1] - time[0])
-    gaps = min(fits - 1, max(1, round(duration * SAMPLES_A_SECOND)))
-    step = max(1, math.ceil((len(time) - 1) / gaps))
-    return np.unique(np.append(np.arange(0, len(time), step), len(time) - 1))
-
-
-def _physics(
-    rollout: Rollout, reference: Trajectory | None, rows: np.ndarray
-) -> dict[str, np.ndarray | None]:
-    """Series of what physics made; torques and forces at their peaks."""
-    world = rollout.world
-    order = [world.model.actuator(name).id for name in world.joints]
-    effort = rollout.actuator_force[:, order] / world.tau_max
-    size = np.linalg.norm(rollout.contact_force, axis=2)
-    out: dict[str, np.ndarray | None] = {
-        "loaded": steadily_loaded(rollout)[rows].astype(float),
-        "force": rollout.contact_force[rows],
-        "size": _peaks(size, rows),
-        "effort": _peaks(effort, rows),
-        "planned": None,
-    }
-    if reference is not None:
-        at = np.minimum(rows * rollout.stride, len(reference.time) - 1)
-        out["planned"] = reference.contact[at].astype(float)
-        out["reference"] = reference.q[at]
-    if rollout.push is not None:
-        at = np.minimum(rows * rollout.stride, len(rollout.push) - 1)
-        size = np.linalg.norm(rollout.push, axis=1)[:, None]
-        out["push"], out["pushSize"] = rollout.push[at], _peaks(size, at)
-        out["base"] = rollout.qpos[rows, :3]
-    return out
-
-
-def _peaks(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n, k) of x (M, k), from each row up to the next: the value farthest from 0."""
-    high = np.maximum.reduceat(x, rows, axis=0)
-    low = np.minimum.reduceat(x, rows, axis=0)
-    return np.where(high >= -low, high, low)
-
-
-def _where(world: World, kin: Kinematics, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Lowest points (n, 3 nS) [m] of the surfaces and the supports (n, nS) below."""
-    names = list(world.supports)
-    points = np.zeros((len(q), len(world.surfaces), 3))
-    support = np.zeros((len(q), len(world.surfaces)))
-    for i, posture in enumerate(q):
-        kin.update(posture)
-        for j, surface in enumerate(world.surfaces):
-            below = support_below(world, kin, surface)
-            points[i, j] = kin.contact_point(surface, below.normal)
-            support[i, j] = names.index(below.name)
-    return {"points": points.reshape(len(q), -1), "support": support}
-
-
-def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> dict[str, np.ndarray]:
-    """(n, 3) largest and mean square joint error [rad], distance of the base [m]."""
-    off = np.abs(q[:, world.qadr] - q_ref[:, world.qadr])
-    base = np.linalg.norm(q[:, :3] - q_ref[:, :3], axis=1)
-    rms = np.sqrt((off**2).mean(axis=1))
-    return {"error": np.stack([off.max(axis=1), rms, base], axis=1)}
 
 
 def _poses(kin: Kinematics, meshes: list[Mesh], q: np.ndarray) -> np.ndarray:
@@ -565,46 +314,6 @@ def _poses(kin: Kinematics, meshes: list[Mesh], q: np.ndarray) -> np.ndarray:
         out[i, :, :3] = kin.data.xpos[bodies]
         out[i, :, 3:] = kin.data.xquat[bodies]
     return out
-
-
-def _seen(world: World, kin: Kinematics, q: np.ndarray) -> np.ndarray:
-    """(m, 3) points that a camera has to have in view [m].
-
-    They are the corners of boxes around some postures, and the near edge.
-    """
-    corners = []
-    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    for posture in q[np.unique(np.linspace(0, len(q) - 1, 40).astype(int))]:
-        kin.update(posture)
-        points = robot_corners(kin)
-        low, high = points.min(axis=0), points.max(axis=0)
-        corners.append(low + sides * (high - low))
-    return np.concatenate([*corners, near_edge_points(world.scene)]).round(3)
-
-
-def steadily_loaded(rollout: Rollout) -> np.ndarray:
-    """(M, nS) bool, the surfaces that bear; gaps, then touches, below 60 ms left out.
-
-    A stiff contact that rolls is without force for a step now and then.
-    """
-    loaded = loaded_surfaces(rollout.world, rollout)
-    last = len(rollout.time) - 1
-    step = float(rollout.time[-1] - rollout.time[0]) / max(last, 1)
-    for column in loaded.T:
-        for state in (True, False):
-            for a, b in runs_of(column != state):
-                if 0 < a and b <= last and (b - a) * step < SHORTEST_LOAD:
-                    column[a:b] = state
-    return loaded
-
-
-def _spells(time: np.ndarray, contact: np.ndarray) -> list[list[tuple[float, float]]]:
-    """For each surface (columns) from when to when it is in contact [s]."""
-    last = len(time) - 1
-    return [
-        [(float(time[a]), float(time[min(b, last)])) for a, b in runs_of(column)]
-        for column in contact.T
-    ]
 
 
 def _box_edges(model: mujoco.MjModel) -> list[float]:

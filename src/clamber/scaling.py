@@ -154,6 +154,7 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
             support=support,
             position=position,
             quaternion=quat_from_matrix(R),
+            firm=c.firm,
         )
 
     stances = []

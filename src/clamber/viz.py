@@ -810,13 +810,18 @@ def stability_of(
             d[i, j] = projected_distance(point, mass)
             length = float(np.linalg.norm(mass - point))
             limit[i, j] = length * math.sin(theta_max(support.friction))
-            points = kin.bearing_points(surface, support.normal)
-            gaps = support.height(points)
-            bearing.append(points[gaps <= max(TOUCHING, float(gaps.min()))])
+            bearing.append(bearing_of(kin, surface, support))
         if bearing:
             polygon = support_polygon(np.concatenate(bearing)[:, :2])
             margin[i] = com_margin(kin.com, polygon)
     return d, limit, margin
+
+
+def bearing_of(kin: Kinematics, surface: str, support: Support) -> np.ndarray:
+    """(k, 3) points of a surface that bear on a support; the nearest one at least."""
+    points = kin.bearing_points(surface, support.normal)
+    gaps = support.height(points)
+    return points[gaps <= max(TOUCHING, float(gaps.min()))]
 
 
 def support_below(world: World, kin: Kinematics, surface: str) -> Support:

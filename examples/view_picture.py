@@ -1,0 +1,49 @@
+"""Take a picture of a run as `clamber view` shows it, with a headless Chromium.
+
+python examples/view_picture.py runs/climb view.jpg [light|dark] [1280x800]
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+
+from playwright.sync_api import sync_playwright
+
+from clamber import open_view
+
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
+         "--enable-unsafe-swiftshader"]  # fmt: skip
+
+
+def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> None:
+    """Open the run, show the recording, go to the middle and take the picture."""
+    width, height = (int(x) for x in size.split("x"))
+    page = open_view(run)
+    with sync_playwright() as p:
+        browser = p.chromium.launch(
+            executable_path=shutil.which("chromium"), args=FLAGS
+        )
+        tab = browser.new_page(
+            viewport={"width": width, "height": height}, color_scheme=scheme
+        )
+        tab.set_default_timeout(120_000)
+        tab.goto(page.url)
+        tab.wait_for_selector("text=go to", state="attached")
+        tab.add_style_tag(content=".mantine-Notification-root {display: none}")
+        tab.wait_for_timeout(3000)
+        if width > 600:
+            tab.get_by_role("tab", name="Show").click()
+            row = tab.locator("label", has_text="recording").locator("xpath=../../..")
+            row.locator("input").click()
+            tab.get_by_role("tab", name="Stances").click()
+        tab.wait_for_timeout(1000)
+        page.clock.go(0.68 * page.clock.end)
+        tab.wait_for_timeout(4000)
+        tab.screenshot(path=out, type="jpeg", quality=72)
+        browser.close()
+    page.close()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,335 @@
+"""The page: a server, its panel and the clock that plays.
+
+All that changes what is shown goes through one lock: callbacks come from a pool of
+threads, the clock from its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io as text_io
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, cast
+
+import numpy as np
+import viser
+
+from clamber.errors import InputError
+from clamber.view import charts
+from clamber.viz import PRESETS, Preset, View, frame_view
+
+FRAMES_A_SECOND = 30
+SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")
+STEP = 0.02  # [s] events nearer than this are where one is
+PORTS = 50  # tried, one after the other
+PANEL_WIDTH = 400  # [px]
+ASPECT = 1.2  # of the picture beside the panel
+PULLED_BACK = 1.15  # cameras stand so much farther than they must
+SHEET = 0.17  # of the distance that what is seen is moved up, over a panel below
+GROUND_SIZE = 12.0  # [m]
+PLAY, PAUSE = "play", "pause"
+BACK, ON = "< contact", "contact >"
+DARK_FIRST = (  # follow the browser's own scheme: its wish is handed to the checkbox
+    '<img src="data:," style="display:none" onerror="'
+    "if(matchMedia('(prefers-color-scheme: dark)').matches)"
+    "for(const l of document.querySelectorAll('label')){"
+    "if(l.textContent.trim()!=='dark')continue;"
+    "let e=l;while(!e.querySelector('input'))e=e.parentElement;"
+    "const i=e.querySelector('input');if(!i.checked)i.click();break}"
+    '">'
+)
+
+
+def free_port(host: str, port: int) -> int:
+    """The first port from `port` on that nobody listens on.
+
+    Raises:
+        InputError: The host is none of this machine, or there is no free port.
+    """
+    if not 1 <= port <= 65535:
+        raise InputError("a port from 1 to 65535", source="--port", value=port)
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(
+            host, 0, type=socket.SOCK_STREAM
+        )[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except OSError as e:
+        raise InputError(
+            f"an address of this machine ({e.strerror or e})",
+            source="--host",
+            value=host,
+        ) from e
+    for candidate in range(port, min(port + PORTS, 65536)):
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            with contextlib.suppress(OSError):
+                probe.bind((host, candidate))
+                return candidate
+    raise InputError(
+        f"a port that is free, or one of the {PORTS - 1} after it",
+        source="--port",
+        value=port,
+    )
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[None]:
+    """Without what viser prints on its own: results are ours to print."""
+    with contextlib.redirect_stdout(text_io.StringIO()):
+        yield
+
+
+class Clock:
+    """Time that plays, is scrubbed and stepped, and what is told of it."""
+
+    def __init__(self, show: Callable[[float], None]) -> None:
+        """Nothing to show yet.
+
+        Args:
+            show: Called with each new time [s], one call at a time.
+        """
+        self.lock = threading.RLock()
+        self.t, self.speed, self.playing = 0.0, 1.0, False
+        self.begin, self.end, self.events = 0.0, 0.0, [0.0]
+        self._show = show
+
+    def span(self, begin: float, end: float, events: Sequence[float]) -> None:
+        """What there is to play [s], and the times to step through."""
+        with self.lock:
+            self.begin, self.end, self.events = begin, end, sorted(events)
+            self.go(self.t)
+
+    def go(self, t: float) -> None:
+        """Show a time."""
+        with self.lock:
+            self.t = min(max(t, self.begin), self.end)
+            self._show(self.t)
+
+    def step(self, way: int) -> None:
+        """To the next event, or the one before; no longer playing."""
+        with self.lock:
+            self.playing = False
+            if way > 0:
+                later = [t for t in self.events if t > self.t + STEP]
+                self.go(later[0] if later else self.end)
+            else:
+                earlier = [t for t in self.events if t < self.t - STEP]
+                self.go(earlier[-1] if earlier else self.begin)
+
+    def toggle(self) -> None:
+        """Play, from the beginning where it is at its end; or pause."""
+        with self.lock:
+            if not self.playing and self.t >= self.end:
+                self.go(self.begin)
+            self.playing = not self.playing and self.end > self.begin
+
+    def advance(self, seconds: float) -> None:
+        """Let so much time pass, where it plays."""
+        with self.lock:
+            if not self.playing:
+                return
+            self.playing = self.t + seconds * self.speed < self.end
+            self.go(self.t + seconds * self.speed)
+
+
+class Page:
+    """What all pages have: ground, cameras, timeline, themes; the server itself."""
+
+    def __init__(self, host: str, port: int, title: str) -> None:
+        """Start serving; nothing is shown yet.
+
+        Args:
+            host: To listen on.
+            port: From which on a free one is taken.
+            title: Of the panel.
+
+        Raises:
+            InputError: There is no such address, or no free port.
+        """
+        self.wanted = port
+        self.missing: list[str] = []
+        port = free_port(host, port)
+        with silent():
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.host, self.port = host, self.server.get_port()
+        self.clock = Clock(self._tell)
+        self._views: dict[Preset, View] = {}
+        self._watchers: list[Callable[[float], None]] = []
+        self._stopped = threading.Event()
+        gui, scene = self.server.gui, self.server.scene
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.set_panel_label(title)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_WIDTH)
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(False)
+        scene.add_light_hemisphere(
+            "/lights/sky",
+            sky_color=(255, 255, 255),
+            ground_color=(170, 165, 160),
+            intensity=2.2,
+        )
+        scene.add_light_directional(
+            "/lights/sun",
+            intensity=2.2,
+            cast_shadow=True,
+            position=(-1.5, -2.5, 4.0),
+        )
+        scene.add_grid(
+            "/ground",
+            GROUND_SIZE,
+            GROUND_SIZE,
+            cell_size=0.1,
+            section_size=0.5,
+            cell_color=(190, 196, 204),
+            section_color=(150, 158, 168),
+            fade_distance=9.0,
+            shadow_opacity=0.2,
+        )
+        gui.add_html(charts.STYLE)
+        self.head = gui.add_html("")
+        self._timeline()
+        self.server.on_client_connect(self._welcome)
+        self._player = threading.Thread(target=self._play, daemon=True)
+        self._player.start()
+
+    @property
+    def url(self) -> str:
+        """Where the page is, from this machine."""
+        wild = self.host in ("0.0.0.0", "::", "")
+        name = "localhost" if wild else self.host
+        return (
+            f"http://[{name}]:{self.port}"
+            if ":" in name
+            else f"http://{name}:{self.port}"
+        )
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._stopped.set()
+        self._player.join()
+        with silent():
+            self.server.stop()
+
+    def watch(self, tell: Callable[[float], None]) -> None:
+        """Have it called with each new time [s]."""
+        self._watchers.append(tell)
+
+    def look(self, view: Callable[[Preset], View]) -> None:
+        """Where cameras begin from now on, and where the buttons take them."""
+        self._views = {name: view(name) for name in PRESETS}
+        first = self._views["corner"]
+        camera = self.server.initial_camera
+        camera.position, camera.look_at = eye_of(first), first.lookat
+        camera.up, camera.fov = (0.0, 0.0, 1.0), np.radians(first.fovy)
+
+    # The panel.
+
+    def _timeline(self) -> None:
+        """Slider, buttons, speed, and the field that clicks in tables write into."""
+        gui, clock = self.server.gui, self.clock
+        self._slider = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+        self._buttons = gui.add_button_group("step", (BACK, PLAY, ON))
+        self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1x")
+        self._go_to = gui.add_text(charts.GO_TO, "")
+
+        @self._slider.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:  # not our own
+                with clock.lock:
+                    clock.go(float(self._slider.value))
+
+        @self._buttons.on_click
+        def _(_: Any) -> None:
+            pressed = self._buttons.value
+            if pressed == PLAY:
+                clock.toggle()
+            else:
+                clock.step(1 if pressed == ON else -1)
+
+        @self._speed.on_update
+        def _(_: Any) -> None:
+            clock.speed = float(self._speed.value.removesuffix("x"))
+
+        @self._go_to.on_update
+        def _(event: Any) -> None:
+            if event.client is None:
+                return
+            text = str(self._go_to.value)
+            with contextlib.suppress(ValueError):
+                t = float(text.removeprefix(charts.CLICKED))
+                with clock.lock:
+                    clock.playing = False
+                    clock.go(t)
+            if text.startswith(charts.CLICKED):
+                self._go_to.value = ""
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """What each browser has of its own: its theme."""
+        dark = client.gui.add_checkbox("dark", False, order=1e9)
+        client.gui.add_html(DARK_FIRST, order=1e9 + 1)
+        if self._views and client.camera.image_width < client.camera.image_height:
+            self.point(client, "corner")
+
+        @dark.on_update
+        def _(_: Any) -> None:
+            client.gui.configure_theme(
+                dark_mode=dark.value, show_logo=False, show_share_button=False
+            )
+
+    def add_cameras(self) -> None:
+        """Buttons for the presets."""
+        buttons = self.server.gui.add_button_group("camera", tuple(PRESETS))
+
+        @buttons.on_click
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self.point(event.client, cast(Preset, buttons.value))
+
+    def point(self, client: viser.ClientHandle, preset: Preset) -> None:
+        """Take a browser's camera to a preset."""
+        view = self._views[preset]
+        eye, at, camera = eye_of(view), view.lookat, client.camera
+        if camera.image_width < camera.image_height:  # upright, the panel below
+            eye = at + (eye - at) * ASPECT * camera.image_height / camera.image_width
+            drop = SHEET * float(np.linalg.norm(eye - at)) * view.axes[1]
+            eye, at = eye - drop, at - drop
+        with client.atomic():
+            camera.position, camera.look_at = eye, at
+
+    # Time.
+
+    def span(self, begin: float, end: float, events: Sequence[float]) -> None:
+        """What there is to play [s], and the times to step through."""
+        self._slider.min, self._slider.max = begin, max(end, begin + 0.01)
+        self.clock.span(begin, end, events)
+
+    def _tell(self, t: float) -> None:
+        with self.server.atomic():
+            self._slider.value = round(t, 2)
+            for tell in self._watchers:
+                tell(t)
+
+    def _play(self) -> None:
+        """Let time pass, in steps of a frame, while somebody looks."""
+        frame = 1.0 / FRAMES_A_SECOND
+        last = time.perf_counter()
+        while not self._stopped.wait(max(0.001, last + frame - time.perf_counter())):
+            now = time.perf_counter()
+            if self.server.get_clients():
+                self.clock.advance(min(now - last, 0.25))
+            last = now
+
+
+def eye_of(view: View) -> np.ndarray:
+    """(3,) where a camera stands [m]."""
+    return view.lookat - PULLED_BACK * view.distance * view.axes[2]
+
+
+def views_of(points: np.ndarray, yaw: float, fovy: float) -> Callable[[Preset], View]:
+    """The view of points (n, 3) from each of the presets."""
+    return lambda name: frame_view(points, ASPECT, yaw=yaw, fovy=fovy, camera=name)

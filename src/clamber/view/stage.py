@@ -1,0 +1,452 @@
+"""A `Frame` in the browser: nodes made once, of which only poses are sent afterwards.
+
+Links hang in one another as the bodies do, so that a hinge that turns is one message,
+and one that does not is none. What has a changing number of parts (contacts, arrows,
+the polygon) is one node each.
+
+Shapes: nb drawn bodies, nS surfaces, k contacts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from clamber.meshes import Mesh
+from clamber.model import World
+from clamber.se3 import (
+    frame_from_normal,
+    matrix_from_quat,
+    quat_conjugate,
+    quat_from_matrix,
+    quat_multiply,
+)
+from clamber.view.person import Figure, Person
+from clamber.view.shown import Frame, Shown, Touch, force_arrow, tube, way_at
+from clamber.viz import PHASE_COLOURS
+
+GHOST = (59, 130, 246)
+PUSH = (162, 28, 175)
+BALANCE, ELLIPSE, COM = (37, 99, 235), (8, 145, 178), (217, 70, 239)
+WAY = (124, 58, 237)
+PERSON, PERSON_BOX = (71, 105, 150), (203, 188, 165)
+BONE, JOINT, HEAD = 0.022, 0.03, 0.1  # [m] radii
+MOST_PARTS = 16  # of a person that are in contact at once
+DISC, DISC_HEIGHT, LIFT = 0.055, 0.004, 0.002  # [m]
+CONE_HEIGHT = 0.14  # [m]
+SIDES = 24
+SEE_THROUGH = 0.6  # opacity of the robot around contacts and forces
+HIDDEN = 1e-4  # scale of a part of a node that is not there
+RECORDING = "recording"
+LAYERS = {  # name in the page: shown at first
+    "planned posture": True,
+    "see-through robot": False,
+    "contacts": True,
+    "forces": True,
+    "friction cones": False,
+    "balance": True,
+    "way of the limb": True,
+    RECORDING: False,
+}
+
+
+class Links:
+    """Bodies that hang in one another."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        root: str,
+        world: World,
+        meshes: Sequence[Mesh],
+        *,
+        ghost: bool = False,
+    ) -> None:
+        """Send the meshes, once.
+
+        Args:
+            server: Whose scene.
+            root: Name of the node that all hang in.
+            world: Whose bodies.
+            meshes: Of them; the world's own is left out.
+            ghost: Pale and see-through.
+        """
+        self.root = server.scene.add_frame(root, show_axes=False)
+        own = [m for m in meshes if m.body != 0]
+        index = {m.body: i for i, m in enumerate(own)}
+        self._rows = np.array([i for i, m in enumerate(meshes) if m.body != 0])
+        names: list[str] = []
+        parents: list[int] = []
+        self._nodes: list[Any] = []
+        self._meshes: list[Any] = []
+        for m in own:
+            parent = int(world.model.body_parentid[m.body])
+            while parent and parent not in index:
+                parent = int(world.model.body_parentid[parent])
+            parents.append(index.get(parent, -1))
+            above = names[parents[-1]] if parents[-1] >= 0 else root
+            names.append(f"{above}/{m.body}")
+            self._nodes.append(server.scene.add_frame(names[-1], show_axes=False))
+            self._meshes += add_mesh(server, f"{names[-1]}/mesh", m, ghost=ghost)
+        self._parents = np.array(parents, dtype=int)
+
+    def see_through(self, on: bool) -> None:
+        """Whether what is inside of them and behind is to be seen."""
+        for mesh in self._meshes:
+            mesh.opacity = SEE_THROUGH if on else None
+
+    def pose(self, poses: np.ndarray) -> None:
+        """Put the bodies where they are.
+
+        Args:
+            poses: (nb, 7) in the world, of all meshes.
+        """
+        p, q = poses[self._rows, :3], poses[self._rows, 3:]
+        up = self._parents
+        inverse = quat_conjugate(q[up])
+        turned = quat_multiply(inverse, q)
+        moved = np.einsum("nij,nj->ni", matrix_from_quat(inverse), p - p[up])
+        turned[up < 0], moved[up < 0] = q[up < 0], p[up < 0]
+        for node, position, wxyz in zip(self._nodes, moved, turned, strict=True):
+            node.position, node.wxyz = position, wxyz
+
+
+def add_mesh(
+    server: viser.ViserServer, name: str, mesh: Mesh, *, ghost: bool = False
+) -> list[Any]:
+    """One node for each colour of a mesh."""
+    nodes = []
+    corners = mesh.colours[mesh.triangles[:, 0]]
+    colours, which = np.unique(corners.round(3), axis=0, return_inverse=True)
+    for i, colour in enumerate(colours):
+        faces = mesh.triangles[which.ravel() == i]
+        used, at = np.unique(faces, return_inverse=True)
+        node = server.scene.add_mesh_simple(
+            f"{name}/{i}",
+            mesh.vertices[used],
+            at.reshape(-1, 3),
+            color=GHOST if ghost else np.round(255 * colour).astype(np.uint8),
+            opacity=0.28 if ghost else None,
+            cast_shadow=not ghost,
+            receive_shadow=not ghost,
+        )
+        nodes.append(node)
+    return nodes
+
+
+def _cylinder(radius: float, height: float, top: float) -> tuple[np.ndarray, ...]:
+    """Vertices and triangles of a cylinder on z = 0, its upper rim scaled by `top`."""
+    a = np.linspace(0.0, 2 * np.pi, SIDES, endpoint=False)
+    ring = radius * np.stack([np.cos(a), np.sin(a), 0.0 * a], axis=1)
+    up = np.array([0.0, 0.0, height])
+    upper = ring * np.array([top, top, 1.0]) + up
+    vertices = np.concatenate([ring, upper, np.zeros((1, 3)), up[None]])
+    i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
+    low, high = np.full(SIDES, 2 * SIDES), np.full(SIDES, 2 * SIDES + 1)
+    faces = np.concatenate(
+        [
+            np.stack([i, j, j + SIDES], 1),
+            np.stack([i, j + SIDES, i + SIDES], 1),
+            np.stack([low, j, i], 1),
+            np.stack([high, i + SIDES, j + SIDES], 1),
+        ]
+    )
+    return vertices, faces
+
+
+class Discs:
+    """Contacts of at most `most` surfaces, coloured by phase."""
+
+    def __init__(self, server: viser.ViserServer, name: str, most: int) -> None:
+        """Send one disc, of which there are `most`."""
+        vertices, faces = _cylinder(DISC, DISC_HEIGHT, 1.0)
+        self._most = most
+        self.node = server.scene.add_batched_meshes_simple(
+            name,
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (most, 1)),
+            np.zeros((most, 3)),
+            batched_scales=np.full((most, 3), HIDDEN),
+            batched_colors=np.zeros((most, 3), dtype=np.uint8),
+            lod="off",
+            cast_shadow=False,
+        )
+
+    def show(self, touches: Sequence[Touch]) -> None:
+        """Put them at the contacts."""
+        p, q, scale, colour = _placed(self._most, touches)
+        self.node.batched_positions, self.node.batched_wxyzs = p, q
+        self.node.batched_scales, self.node.batched_colors = scale, colour
+
+
+class Cones:
+    """Friction cones of contacts: the forces that do not slip lie inside."""
+
+    def __init__(self, server: viser.ViserServer, name: str, most: int) -> None:
+        """Send one cone of friction 1, of which there are `most`."""
+        vertices, faces = _cylinder(1e-3, CONE_HEIGHT, CONE_HEIGHT / 1e-3)
+        self._most = most
+        self.node = server.scene.add_batched_meshes_simple(
+            name,
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (most, 1)),
+            np.zeros((most, 3)),
+            batched_scales=np.full((most, 3), HIDDEN),
+            batched_colors=np.zeros((most, 3), dtype=np.uint8),
+            lod="off",
+            opacity=0.3,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def show(self, touches: Sequence[Touch]) -> None:
+        """Put them at the contacts, as wide as their friction."""
+        p, q, scale, colour = _placed(self._most, touches)
+        for i, touch in enumerate(touches[: self._most]):
+            scale[i] = [touch.friction, touch.friction, 1.0]
+        self.node.batched_positions, self.node.batched_wxyzs = p, q
+        self.node.batched_scales, self.node.batched_colors = scale, colour
+
+
+def _placed(
+    most: int, touches: Sequence[Touch]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Position, orientation, scale and colour of the parts of a node."""
+    p, scale = np.zeros((most, 3)), np.full((most, 3), HIDDEN)
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (most, 1))
+    colour = np.zeros((most, 3), dtype=np.uint8)
+    for i, touch in enumerate(touches[:most]):
+        p[i] = touch.position + LIFT * touch.normal
+        q[i] = quat_from_matrix(frame_from_normal(touch.normal, [1.0, 0.0, 0.0]))
+        scale[i] = 1.0
+        colour[i] = PHASE_COLOURS[touch.phase]
+    return p, q, scale, colour
+
+
+class Balance:
+    """Support polygon, its ellipse, the centre of mass and its projection."""
+
+    def __init__(self, server: viser.ViserServer, name: str) -> None:
+        """Send what has no shape yet."""
+        add = server.scene
+        self.root = add.add_frame(name, show_axes=False)
+        flat = np.zeros((3, 3))
+        self._area = add.add_mesh_simple(
+            f"{name}/area",
+            flat,
+            np.array([[0, 1, 2]]),
+            color=BALANCE,
+            opacity=0.18,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._lines = add.add_line_segments(
+            f"{name}/lines", np.zeros((1, 2, 3)), np.zeros((1, 2, 3)), thickness=0.006
+        )
+        self._com = add.add_icosphere(f"{name}/com", radius=0.022, color=COM)
+        vertices, faces = _cylinder(0.018, 0.003, 1.0)
+        self._foot = add.add_mesh_simple(
+            f"{name}/foot", vertices, faces, color=COM, cast_shadow=False
+        )
+
+    def show(self, frame: Frame) -> None:
+        """Draw those of a frame, to the millimetre: what has not moved is not sent."""
+        lift = np.array([0.0, 0.0, LIFT])
+        polygon, ellipse = frame.polygon.round(3), frame.ellipse.round(3)
+        drop = np.stack([frame.foot, frame.com]).round(3)
+        rings = [(polygon, BALANCE), (ellipse, ELLIPSE)]
+        segments, colours = [drop[None]], [np.tile(COM, (1, 2, 1))]
+        for ring, colour in rings:
+            if len(ring) > 1:
+                ring = ring + 2 * lift
+                segments.append(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
+                colours.append(np.tile(colour, (len(ring), 2, 1)))
+        points, shades = np.concatenate(segments), np.concatenate(colours)
+        if len(points) != len(self._lines.points):
+            self._lines.colors = shades.astype(np.uint8)
+        self._lines.points = points
+        self._area.visible = len(polygon) > 2
+        if len(polygon) > 2:
+            fan = np.arange(1, len(polygon) - 1)
+            faces = np.stack([0 * fan, fan, fan + 1], axis=1).astype(np.uint32)
+            if len(polygon) != len(self._area.vertices):
+                self._area.faces = faces
+            self._area.vertices = polygon + lift
+        self._com.position, self._foot.position = drop[1], drop[0]
+
+
+class Stage:
+    """The scene of a run, and what changes in it."""
+
+    def __init__(self, server: viser.ViserServer, shown: Shown, root: str) -> None:
+        """Send all that does not change.
+
+        Args:
+            server: Whose scene.
+            shown: The run.
+            root: Name of the node that all hang in.
+        """
+        world, add = shown.world, server.scene
+        self._shown = shown
+        self.root = add.add_frame(root, show_axes=False)
+        for m in shown.meshes:
+            if m.body == 0:
+                add_mesh(server, f"{root}/scene", m)
+        most = len(world.surfaces)
+        self._robot = Links(server, f"{root}/robot", world, shown.meshes)
+        self._ghost = None
+        if shown.reference is not None:
+            self._ghost = Links(
+                server, f"{root}/ghost", world, shown.meshes, ghost=True
+            )
+        self._discs = Discs(server, f"{root}/contacts", most)
+        self._cones = Cones(server, f"{root}/cones", most)
+        self._arrows = add.add_arrows(
+            f"{root}/forces",
+            np.zeros((1, 2, 3)),
+            np.zeros((1, 3), dtype=np.uint8),
+            shaft_radius=0.009,
+            head_radius=0.02,
+            head_length=0.045,
+        )
+        self._balance = Balance(server, f"{root}/balance")
+        self._ways = []
+        for i, way in enumerate(shown.ways):
+            vertices, faces = tube(way.points, way.radius)
+            name = f"{root}/way{i}"
+            node = add.add_frame(name, show_axes=False, visible=False)
+            add.add_mesh_simple(
+                f"{name}/margin",
+                vertices,
+                faces,
+                color=WAY,
+                opacity=0.16,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            line = np.stack([way.points[:-1], way.points[1:]], axis=1)
+            add.add_line_segments(f"{name}/line", line, WAY, thickness=0.008)
+            self._ways.append(node)
+        self._layers: dict[str, bool] = dict(LAYERS)
+        self._robot.see_through(LAYERS["see-through robot"])
+
+    def layer(self, name: str, shown: bool) -> None:
+        """Show or hide one of `LAYERS`; what it holds follows with the next frame."""
+        self._layers[name] = shown
+        if name == "see-through robot":
+            self._robot.see_through(shown)
+
+    def show(self, frame: Frame) -> None:
+        """Send what differs from the last frame."""
+        on = self._layers
+        self._robot.pose(frame.poses)
+        if self._ghost is not None:
+            self._ghost.root.visible = on["planned posture"]
+            if frame.ghost is not None and on["planned posture"]:
+                self._ghost.pose(frame.ghost)
+        self._discs.node.visible = on["contacts"]
+        if on["contacts"]:
+            self._discs.show(frame.touches)
+        self._cones.node.visible = on["friction cones"]
+        if on["friction cones"]:
+            self._cones.show(frame.touches)
+        self._show_forces(frame)
+        self._balance.root.visible = on["balance"]
+        if on["balance"]:
+            self._balance.show(frame)
+        way = way_at(self._shown, frame.time) if on["way of the limb"] else None
+        for node, its in zip(self._ways, self._shown.ways, strict=True):
+            node.visible = its is way
+
+    def _show_forces(self, frame: Frame) -> None:
+        arrows, colours = [], []
+        for touch in frame.touches:
+            arrow = force_arrow(self._shown.world, touch)
+            if arrow is not None:
+                arrows.append(arrow)
+                colours.append(PHASE_COLOURS[touch.phase])
+        if frame.push is not None:
+            arrows.append(frame.push)
+            colours.append(PUSH)
+        self._arrows.visible = bool(arrows) and self._layers["forces"]
+        if self._arrows.visible:
+            if len(arrows) != len(self._arrows.points):
+                self._arrows.colors = np.array(colours, dtype=np.uint8)
+            self._arrows.points = np.array(arrows)
+            self._arrows.colors = np.array(colours, dtype=np.uint8)
+
+
+class Stick:
+    """A person as bones and joints, among its boxes, with its contacts."""
+
+    def __init__(self, server: viser.ViserServer, person: Person, root: str) -> None:
+        """Send boxes, a bone and a joint.
+
+        Args:
+            server: Whose scene.
+            person: The recording.
+            root: Name of the node that all hang in.
+        """
+        add = server.scene
+        self._person = person
+        self.root = add.add_frame(root, show_axes=False)
+        for i, box in enumerate(person.demo.scene.boxes):
+            add.add_box(
+                f"{root}/box{i}",
+                color=PERSON_BOX,
+                dimensions=tuple(box.size),
+                wxyz=quat_from_matrix(box.rotation),
+                position=box.position + person.offset,
+            )
+        count, joints = len(person.bones), len(person.joints)
+        vertices, faces = _cylinder(BONE, 1.0, 1.0)
+        common: dict[str, Any] = {"lod": "off", "cast_shadow": True}
+        self._bones = add.add_batched_meshes_simple(
+            f"{root}/bones",
+            vertices,
+            faces,
+            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+            np.zeros((count, 3)),
+            batched_scales=np.ones((count, 3)),
+            batched_colors=PERSON,
+            **common,
+        )
+        ball, triangles = tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2e-6]]), JOINT)
+        size = np.ones(joints)
+        if "Head" in person.demo.names:
+            size[-1] = HEAD / JOINT
+        self._joints = add.add_batched_meshes_simple(
+            f"{root}/joints",
+            ball,
+            triangles,
+            np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)),
+            np.zeros((joints, 3)),
+            batched_scales=size,
+            batched_colors=PERSON,
+            **common,
+        )
+        self._discs = Discs(server, f"{root}/contacts", MOST_PARTS)
+
+    def show(self, figure: Figure) -> None:
+        """Put the person where it is; bones that were not seen are not shown."""
+        a, way = figure.bones[:, 0], figure.bones[:, 1] - figure.bones[:, 0]
+        length = np.linalg.norm(way, axis=1)
+        self._bones.batched_positions = a
+        self._bones.batched_wxyzs = np.array(
+            [
+                quat_from_matrix(frame_from_normal(d / max(l, 1e-9), [1.0, 0.0, 0.0]))
+                for d, l in zip(way, length, strict=True)
+            ]
+        )
+        scale = np.stack([np.ones_like(length)] * 2 + [length], axis=1)
+        scale[~figure.seen] = HIDDEN
+        self._bones.batched_scales = scale
+        self._joints.batched_positions = figure.joints
+        self._discs.show(figure.touches)
