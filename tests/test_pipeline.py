@@ -190,13 +190,13 @@ def test_a_box_that_is_near_but_too_high_is_an_incomplete_plan(demo_sequence, co
 
 @pytest.fixture(scope="module")
 def ask_judge():
-    """`ask_judge(folder, height)`: the independent judge's verdict on a run folder."""
+    """`ask_judge(folder, height, goal)`: the independent judge's verdict on a run."""
     script = ROOT.parent / "shared" / "judge" / "judge.py"
 
-    def ask(folder: Path, height: float) -> dict:
+    def ask(folder: Path, height: float, goal: str = "top") -> dict:
         if not script.is_file():
             pytest.skip("no judge beside the repository")
-        command = [sys.executable, str(script), str(folder), "--goal", "top"]
+        command = [sys.executable, str(script), str(folder), "--goal", goal]
         command += ["--height", str(height), "--min-mass", "28", "--max-effort", "50"]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode in (0, 1), done.stderr
@@ -260,6 +260,29 @@ def test_a_real_recording_is_climbed(coman, shared, tmp_path, ask_judge):
     result, rollout = climb(detect_contacts(recording), coman, 0.262, tmp_path)
     assert judge(result, rollout).reached
     assert refused(ask_judge(tmp_path, 0.262)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "height"), [("climb-0", 0.262), ("climb-1", 0.38), ("climb-1", 0.42)]
+)
+def test_the_robot_stands_up_as_the_person_does(
+    coman, shared, tmp_path, ask_judge, name, height
+):
+    """On hands and knees, then on its feet; climb-1 at its own ratio is 0.42 m."""
+    from clamber.demo import load_demo
+    from clamber.detect import detect_contacts
+
+    if not (shared / "demos" / name / "joints.npy").is_file():
+        pytest.skip(f"no recording {name} beside the repository")
+    recording = load_demo(str(ROOT / "examples" / "recordings" / f"{name}-stand.yaml"))
+    result, rollout = climb(detect_contacts(recording), coman, height, tmp_path)
+    last = result.keyframes[-1].stance
+    assert {c.surface for c in last} == {"LFoot", "RFoot"}
+    assert {c.support for c in last} == {"box"}
+    assert judge(result, rollout).reached
+    for goal in ("top", "stand"):
+        assert refused(ask_judge(tmp_path, height, goal)) == {}
 
 
 @pytest.mark.slow

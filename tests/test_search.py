@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from clamber.posture.keyframe import KeyframeOptions
 from clamber.scaling import retarget
 from clamber.scene import Box, Scene
 from clamber.se3 import matrix_from_rpy
-from clamber.search import plan_step, plan_steps, repair, standing
-from clamber.transition import MOVED
+from clamber.search import plan_step, plan_steps, repairs, standing
+from clamber.transition import MARGINS, MOVED
 
 OPTIONS = KeyframeOptions()
 HEIGHT = 0.275
@@ -174,26 +175,40 @@ def test_no_repair_is_proposed_where_nothing_stands_on_a_contact_that_was_made(
     ik, steps
 ):
     start = standing(ik, OPTIONS)
-    assert repair(ik, [start], [], steps[0].move) is None
+    assert list(repairs(ik, [start], [], steps[0].move)) == []
+
+
+class FakePath(str):
+    """A name with a margin."""
+
+    def __new__(cls, name, margin):
+        path = super().__new__(cls, f"path of {name}")
+        path.transition = SimpleNamespace(margin=margin)
+        return path
 
 
 class FakePlanner:
-    """Stands in for `plan_step` and `repair`: names instead of postures."""
+    """Stands in for `plan_step` and `repairs`: names instead of postures."""
 
-    def __init__(self, monkeypatch, fails, repairs_to):
+    def __init__(
+        self, monkeypatch, fails, repairs_to, margin=lambda name, tried: MARGINS[0]
+    ):
         self.fails, self.repairs_to, self.tried = fails, repairs_to, []
+        self.margin = margin
         monkeypatch.setattr(search, "plan_step", self.plan_step)
-        monkeypatch.setattr(search, "repair", self.repair)
+        monkeypatch.setattr(search, "repairs", self.repairs)
 
     def plan_step(self, ik, before, step, method, options, lap):
         name = step.move.limb + ("!" if step.move.firm else "")
         self.tried.append(name)
         if self.fails(name, self.tried):
             return f"{name} fails"
-        return name, f"path of {name}"
+        return name, FakePath(name, self.margin(name, self.tried))
 
-    def repair(self, ik, keyframes, paths, move):
-        return self.repairs_to(move.limb, paths)
+    def repairs(self, ik, keyframes, paths, move, margin=MARGINS[-1]):
+        self.asked = margin
+        better = self.repairs_to(move.limb, paths)
+        return iter([] if better is None else [better])
 
 
 def fake_steps(*names: tuple[str, int]) -> list[Step]:
@@ -269,6 +284,51 @@ def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert found.keyframes[1:] == ("a!", "b", "c")
     assert found.missed == ()
+
+
+def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(ik, monkeypatch):
+    contact = fake_steps(("a", 1))[0].move.makes
+    fake = FakePlanner(
+        monkeypatch,
+        lambda name, tried: False,
+        lambda limb, paths: ({0: contact}, Guide()),
+        lambda name, tried: MARGINS[name == "c" and "a!" not in tried],
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
+    assert fake.asked == MARGINS[0]
+    assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
+    assert found.keyframes[1:] == ("a!", "b", "c", "d")
+    assert found.paths == tuple(f"path of {n}" for n in ("a!", "b", "c", "d"))
+    assert [p.transition.margin for p in found.paths] == [MARGINS[0]] * 4
+
+
+@pytest.mark.parametrize("worse", ["a!", "b"])
+def test_no_step_loses_its_margin_to_another_one(ik, monkeypatch, worse):
+    contact = fake_steps(("a", 1))[0].move.makes
+    FakePlanner(
+        monkeypatch,
+        lambda name, tried: False,
+        lambda limb, paths: ({0: contact}, Guide()),
+        lambda name, tried: MARGINS[name == worse if "a!" in tried else name == "c"],
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
+    assert found.keyframes[1:] == ("a", "b", "c")
+    assert [p.transition.margin for p in found.paths] == [*MARGINS[:1] * 2, MARGINS[-1]]
+
+
+def test_a_step_with_a_small_margin_counts_where_others_would_be_missed(
+    ik, monkeypatch
+):
+    contact = fake_steps(("a", 1))[0].move.makes
+    FakePlanner(
+        monkeypatch,
+        lambda name, tried: name == "b" and "a!" in tried,
+        lambda limb, paths: ({0: contact}, Guide()) if paths else None,
+        lambda name, tried: MARGINS[name == "c"],
+    )
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
+    assert found.missed == ()
+    assert found.keyframes[1:] == ("a", "b", "c")
 
 
 def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkeypatch):

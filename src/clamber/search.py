@@ -7,7 +7,7 @@ planning goes on from there; where nothing helps, the step is skipped with its r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,26 +84,49 @@ def plan_steps(
     missed: dict[int, Skipped] = {}  # by step
     steps = list(steps)
     done: list[int] = []  # the step that each path makes
-    repairs = k = 0
+    mended = k = 0
     while k < len(steps):
         step = steps[k]
         report("plan", k / len(steps), str(step.move))
         result = plan_step(ik, keyframes[-1], step, method, options, lap)
         if not isinstance(result, str):
+            roomier = None
+            if mended < MAX_REPAIRS and _margin(result[1]) < MARGINS[0]:
+                roomier = _roomier(
+                    ik,
+                    keyframes,
+                    paths,
+                    [steps[i] for i in done],
+                    step,
+                    method,
+                    options,
+                    lap,
+                )
+            if roomier is not None:
+                mended += 1
+                j, again, made = roomier
+                for i, changed in zip([*done[j:], k], again, strict=True):
+                    steps[i] = changed
+                del keyframes[j + 1 :], paths[j:]
+                keyframes += [key for key, _ in made]
+                paths += [path for _, path in made]
+                done.append(k)
+                k += 1
+                continue
             keyframes.append(result[0])
             paths.append(result[1])
             done.append(k)
             k += 1
             continue
         better = None
-        if repairs < MAX_REPAIRS:
-            better = repair(ik, keyframes, paths, step.move)
+        if mended < MAX_REPAIRS:
+            better = next(repairs(ik, keyframes, paths, step.move), None)
             lap("repairs")
         if better is None:
             missed[k] = Skipped(stance=step.stance, reason=result, missed=True)
             k += 1
             continue
-        repairs += 1
+        mended += 1
         places, guide = better
         steps[k] = replace(step, guide=guide)
         for j, contact in places.items():
@@ -116,6 +139,46 @@ def plan_steps(
     return Found(
         keyframes=tuple(keyframes), paths=tuple(paths), missed=tuple(missed.values())
     )
+
+
+def _margin(path: Path) -> float:
+    return path.transition.margin
+
+
+def _roomier(
+    ik: IK,
+    keyframes: list[Keyframe],
+    paths: list[Path],
+    done: list[Step],
+    step: Step,
+    method: str,
+    options: KeyframeOptions,
+    lap: Callable[[str], None],
+) -> tuple[int, list[Step], list[tuple[Keyframe, Path]]] | None:
+    """A step with the largest margin, for which earlier contacts are put elsewhere.
+
+    Returns:
+        The first path to be replaced, its step and those after it up to `step`, and
+        what has been planned for them; None where that does not help.
+    """
+    for places, guide in repairs(ik, keyframes, paths, step.move, margin=MARGINS[0]):
+        lap("repairs")
+        j = min(places)
+        again = [*done[j:], replace(step, guide=guide)]
+        for i, contact in places.items():
+            firm = replace(again[i - j].move, makes=contact, firm=True)
+            again[i - j] = replace(again[i - j], move=firm)
+        key, made = keyframes[j], []
+        for s in again:
+            least = MARGINS[0] if s is again[-1] else _margin(paths[j + len(made)])
+            result = plan_step(ik, key, s, method, options, lap)
+            if isinstance(result, str) or _margin(result[1]) < least:
+                break
+            key = result[0]
+            made.append(result)
+        else:
+            return j, again, made
+    return None
 
 
 def standing(
@@ -176,16 +239,21 @@ def home_at(world: World, at: np.ndarray) -> np.ndarray:
     return q
 
 
-def repair(
-    ik: IK, keyframes: list[Keyframe], paths: list[Path], move: Move
-) -> tuple[dict[int, Contact], Guide] | None:
+def repairs(
+    ik: IK,
+    keyframes: list[Keyframe],
+    paths: list[Path],
+    move: Move,
+    *,
+    margin: float = MARGINS[-1],
+) -> Iterator[tuple[dict[int, Contact], Guide]]:
     """Which earlier paths should have made their contacts elsewhere for `move` to work.
 
     Looks at one contact after the other, the last one first, and then at all at once.
 
-    Returns:
+    Yields:
         By index of the path, the contact at its better place, and the posture that
-        `move` then goes through; None where none helps.
+        `move` then goes through.
     """
     standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
     made: dict[str, int] = {}
@@ -194,11 +262,10 @@ def repair(
         if new is not None and new.surface in standing_on and new.surface not in made:
             made[new.surface] = j
     for surfaces in (*([x] for x in made), list(made)):
-        eased = eased_contacts(ik, keyframes[-1], move, surfaces)
+        eased = eased_contacts(ik, keyframes[-1], move, surfaces, margin=margin)
         if eased is not None:
             contacts, guide = eased
-            return {made[c.surface]: c for c in contacts}, guide
-    return None
+            yield {made[c.surface]: c for c in contacts}, guide
 
 
 def plan_step(

@@ -254,7 +254,12 @@ def _touch(
 
 
 def eased_contacts(
-    ik: IK, before: Keyframe, move: Move, surfaces: Collection[str]
+    ik: IK,
+    before: Keyframe,
+    move: Move,
+    surfaces: Collection[str],
+    *,
+    margin: float = MARGINS[-1],
 ) -> tuple[tuple[Contact, ...], Guide] | None:
     """Where earlier contacts should have been for a move to work.
 
@@ -266,6 +271,7 @@ def eased_contacts(
         before: Keyframe it starts from.
         move: That does not work.
         surfaces: Whose contacts are free.
+        margin: Of the centre of mass to the border of its polygon [m].
 
     Returns:
         The contacts at their better places, and the posture found with them; None where
@@ -285,6 +291,7 @@ def eased_contacts(
         q_reference=before.q,
         extra=free,
         touching=touching,
+        margin=margin,
     )
     problems = {"shifted": shift}
     if move.makes is not None:
@@ -295,6 +302,7 @@ def eased_contacts(
             q_reference=before.q,
             extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
             touching=touching | {new.surface: new.support},
+            margin=margin,
         )
     for posture, problem in problems.items():
         solution = ik.solve_hard(problem, before.q)
