@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 import clamber
-from clamber import cli
+from clamber import cli, terminal
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
@@ -184,7 +184,7 @@ def test_the_flags_of_planning_are_fields_of_its_options():
 
 def test_progress_on_a_log_is_one_line_for_each_tenth():
     log = io.StringIO()
-    report = cli._lines(Console(file=log, width=80))
+    report = terminal.progress_lines(Console(file=log, width=80))
     for k in range(200):
         report("plan", k / 200, f"move {k}")
     report("simulate", 1.0, "")
@@ -197,7 +197,7 @@ def test_progress_on_a_log_is_one_line_for_each_tenth():
 def test_progress_on_a_terminal_shows_stage_share_and_time_left():
     screen = io.StringIO()
     console = Console(file=screen, width=100, force_terminal=True)
-    with cli._bars(console) as report:
+    with terminal.progress_bars(console) as report:
         report("plan", 0.0, "LHand")
         report("plan", 0.5, "[RHand]")
         report("simulate", 0.2, "")

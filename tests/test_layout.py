@@ -69,6 +69,7 @@ LAYERS = [
     "meshes",
     "report",
     "",  # the package itself: its public names
+    "terminal",
     "cli",
 ]
 
