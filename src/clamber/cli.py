@@ -5,7 +5,7 @@ functions in order, as `clamber.<name>`: those are imported on first use, so tha
 `--help` answers at once. Progress goes to stderr, results to stdout.
 
 Exit codes: 0 the robot made it (or the command did its work), 1 it did not, 2 bad
-input, 130 interrupted.
+input, 130 interrupted, 141 nobody reads the output any more.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import contextlib
 import io as text_io
 import json
 import math
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,11 +33,13 @@ from clamber.terminal import (
     INTERRUPTED,
     MISSED,
     REACHED,
+    READER_GONE,
     Clock,
     Output,
     Report,
+    closing,
     conclude,
-    keyframe_table,
+    keyframe_tables,
     new_table,
     outcome,
     plan_record,
@@ -50,6 +53,7 @@ DESCRIPTION = (
     "Turns a recording of a person climbing over an obstacle into a motion that a "
     "humanoid robot executes in physics. Try: clamber climb --video"
 )
+SHELLS = ("bash", "zsh")
 
 
 def _default(module: str, record: str, name: str) -> Any:
@@ -185,7 +189,7 @@ def _scene(height: float | None, path: Path | None) -> clamber.Scene:
     from clamber.job import scene_of
 
     if path is not None and height is not None:
-        raise InputError("--height or --scene, not both")
+        raise InputError("--height, --scene: give one of them alone")
     return scene_of(DEFAULT_HEIGHT if height is None else height, path)
 
 
@@ -271,7 +275,10 @@ class ContactsCommand:
             clamber.save_sequence(sequence, folder / "sequence.json")
         table = new_table("stance", "region", "from [s]", "to [s]", "contacts")
         for i, stance in enumerate(sequence.stances):
-            on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
+            on = ", ".join(
+                f"{' '.join(surfaces)} on {support}"
+                for support, surfaces in _by_support(stance).items()
+            )
             t0, t1 = sequence.t[i], sequence.t[i + 1]
             table.add_row(str(i), stance.region, f"{t0:.2f}", f"{t1:.2f}", on)
         record = {
@@ -282,6 +289,14 @@ class ContactsCommand:
         note = "\n".join([*demo.notes, f"the sequence is in {folder}"])
         self.output.show(record, table, note=note)
         return REACHED
+
+
+def _by_support(stance: clamber.Stance) -> dict[str, list[str]]:
+    """The surfaces on each support."""
+    found: dict[str, list[str]] = {}
+    for c in stance.contacts:
+        found.setdefault(c.support, []).append(c.surface)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,9 +323,9 @@ class PlanCommand:
             with self.world.blamed():
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
         record = {"out": str(folder), **plan_record(plan, clock)}
-        note = f"{outcome(plan)}; the files are in {folder}"
+        note = closing(outcome(plan), folder, plan.complete)
         self.output.show(
-            record, keyframe_table(record), *skipped_tables(plan), note=note
+            record, *keyframe_tables(record), *skipped_tables(plan), note=note
         )
         return REACHED if plan.complete else MISSED
 
@@ -377,8 +392,9 @@ class ReplanCommand:
                 str(len(r.plan.paths)),
                 "" if r.stable else outcome(r.plan),
             )
-        note = "the best one is planned" if found.best.stable else described(found)
-        self.output.show({}, table, note=f"{note}; the files are in {folder}")
+        stable = found.best.stable
+        note = "the best one is planned" if stable else described(found)
+        self.output.show({}, table, note=closing(note, folder, stable))
         return REACHED if found.best.stable else MISSED
 
     def _rest(self, begin: str) -> int:
@@ -400,12 +416,14 @@ class ReplanCommand:
             clamber.save_plan(plan, folder)
         record = {"out": str(folder), "made": now.made, **plan_record(plan)}
         on = ", ".join(f"{c.surface} on {c.support}" for c in now.contacts)
-        note = (
-            f"from {on}, {now.made} steps made: {outcome(plan)}; the files are in"
-            f" {folder}"
+        note = f"from {on}, {now.made} steps made: {outcome(plan)}"
+        tables = keyframe_tables(record) if plan.keyframes else []
+        self.output.show(
+            record,
+            *tables,
+            *skipped_tables(plan),
+            note=closing(note, folder, plan.complete),
         )
-        tables = [keyframe_table(record)] if plan.keyframes else []
-        self.output.show(record, *tables, *skipped_tables(plan), note=note)
         return REACHED if plan.complete else MISSED
 
 
@@ -513,7 +531,7 @@ class LearnCommand:
         from clamber.policy_plots import save_pictures
 
         if not self.demonstrations:
-            raise InputError("at least one demonstration, such as crossing")
+            raise InputError("no demonstration: name at least one, such as crossing")
         if self.out is not None and self.out.suffix != ".json":
             raise InputError(
                 "a file that ends in .json", source="--out", value=str(self.out)
@@ -598,13 +616,13 @@ class RenderCommand:
         """One of the three, and flags that go with it."""
         asked = [self.video, self.sheet, self.frame is not None]
         if sum(asked) > 1:
-            raise InputError("--video, --sheet or --frame, one of them")
+            raise InputError("--video, --sheet, --frame: give one of them alone")
         if self.transparent and self.frame is None:
-            raise InputError("--transparent with --frame alone")
+            raise InputError("--transparent: give --frame too, or leave it out")
         special = self.camera != "corner" or self.size or self.out
         if special and not any(asked):
             raise InputError(
-                "--camera, --size and --out with --video, --sheet or --frame"
+                "--camera, --size, --out: give --video, --sheet or --frame too"
             )
 
     def _draw(self, report: Report) -> list[Path]:
@@ -818,7 +836,9 @@ class RobotCommand:
             out = out or Path("robots") / proposal.name
             if out.exists() and (not out.is_dir() or any(out.iterdir())):
                 raise InputError(
-                    "a new or empty folder", source="--out", value=str(out)
+                    "a new or empty folder",
+                    source="--out",
+                    value=str(out),
                 )
             out = clamber.new_run_folder(out, "robot")
             clamber.save_proposal(proposal, out)
@@ -890,7 +910,7 @@ class SweepCommand:
         if self.workers is not None and self.workers < 1:
             raise InputError("1 or more", source="--workers", value=self.workers)
         if self.workers is not None and self.scheduler is not None:
-            raise InputError("--workers or --scheduler, not both")
+            raise InputError("--workers, --scheduler: give one of them alone")
         spec = experiment.load_spec(self.spec)
         folder = self.out or Path("runs") / self.spec.stem
         sweep.check_inputs(spec)
@@ -1017,19 +1037,37 @@ def _parse(args: Sequence[str]) -> Any:
 
 
 def _sentence(box: str) -> str:
-    """The text of an error box, up to its first rule, on one line."""
-    rows = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
-    text = []
-    for row in rows:
-        if row and not row.strip("─"):
-            break
-        text.append(row)
-    words = " ".join(" ".join(text).split())
-    wrong = re.match(r"(.*): no type matching (.*) could be .* from (.*?)\.", words)
-    if wrong:
-        flag, kind, value = wrong.groups()
-        words = f"{flag}: {value}, expected {kind.removeprefix('{None}|')}"
-    return words or "flags as in --help"
+    """The text of an error box on one line: what is wrong, then which help to read.
+
+    Below its title a box, of lines or of plain dashes, has parts between rules.
+    """
+    parts = [""]
+    for line in box.splitlines()[1:]:
+        row = line.strip("│╭╮╰╯ ")
+        if row and not row.strip("─-"):
+            parts.append("")
+        else:
+            parts[-1] += f" {row}"
+    wrong, *rest = [" ".join(p.split()) for p in parts if p.strip()] or ["wrong flags"]
+    odd = re.match(r"(.*): no type matching (.*) could be .* from (.*?)\.", wrong)
+    if odd:
+        flag, kind, value = odd.groups()
+        wrong = f"{flag}: {value}, expected {kind.removeprefix('{None}|')}"
+    more = " ".join(rest)
+    meant = re.search(r"Perhaps you meant: (--[\w.-]+)", more)
+    if meant:
+        wrong += f", perhaps {meant[1]} is meant"
+    helped = re.search(r"For full helptext, \w+:? (clamber.*--help)", more)
+    return f"{wrong.rstrip('.')}; {helped[1] if helped else 'clamber --help'} says more"
+
+
+def _by_flag(error: InputError) -> InputError:
+    """A value that came from no file, under its name on the command line."""
+    from clamber.job import FLAGS
+
+    if error.source is not None or error.field not in FLAGS:
+        return error
+    return InputError(error.expected, source=f"--{error.field}", value=error.value)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -1042,10 +1080,29 @@ def main(args: Sequence[str] | None = None) -> int:
     if argv[: len(lead)] == lead:  # also before the command
         argv = argv[len(lead) :] + lead
     try:
+        if argv[:1] == ["--completion"]:
+            return _complete(argv[1:])
         return _parse(argv).run()
     except ClamberError as e:
-        sys.stderr.write(f"clamber: {e}\n")
+        error = _by_flag(e) if isinstance(e, InputError) else e
+        sys.stderr.write(f"clamber: {error}\n")
         return BAD_INPUT
     except KeyboardInterrupt:
         sys.stderr.write("clamber: interrupted; the files written so far are whole\n")
         return INTERRUPTED
+    except BrokenPipeError:  # `clamber ... | head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_GONE
+
+
+def _complete(shell: Sequence[str]) -> int:
+    """Print the script that makes a shell complete commands, flags and values."""
+    if len(shell) != 1 or shell[0] not in SHELLS:
+        raise InputError(
+            "bash or zsh, as in: source <(clamber --completion bash)",
+            source="--completion",
+            value=" ".join(shell) or "nothing",
+        )
+    with contextlib.suppress(SystemExit):  # the parser's way of having done its work
+        _parse(["--tyro-print-completion", shell[0]])
+    return REACHED

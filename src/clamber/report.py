@@ -38,6 +38,7 @@ from clamber.io import (
     EXECUTION,
     PLAN,
     ROLLOUT,
+    RUN_MAKERS,
     SCENE,
     TIMINGS,
     TRAJECTORY,
@@ -201,7 +202,7 @@ def run_record(folder: Path) -> dict[str, Any]:
         InputError: It is no folder, or nothing in it can be read.
     """
     if not folder.is_dir():
-        raise InputError("a run folder", source=folder)
+        raise InputError(f"a run folder; {RUN_MAKERS}", source=folder)
     reading = _Reading(folder)
     written = reading.fields(PLAN)
     ran = reading.has(ROLLOUT)
@@ -226,7 +227,7 @@ def run_record(folder: Path) -> dict[str, Any]:
     picture = reading.attempt(lambda: _picture(folder / PERSON))
     if not (written or verdict or execution or picture):
         raise InputError(
-            f"a run folder with {PLAN} or {VERDICT} ({'; '.join(reading.missing)})",
+            f"a run folder with a whole {PLAN} or {VERDICT}; {RUN_MAKERS}",
             source=folder,
         )
     if written and not ran and not verdict:

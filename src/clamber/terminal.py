@@ -28,9 +28,9 @@ from rich.table import Table
 
 import clamber
 
-REACHED, MISSED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: the robot made it (or the command did its work), it did not, bad
-input, interrupted."""
+input, interrupted, nobody reads the output any more (as in `clamber ... | head`)."""
 
 Report = Callable[[str, float, str], None]
 
@@ -63,12 +63,16 @@ class Output:
                 json.dumps({"version": 1, **record}, allow_nan=False) + "\n"
             )
         elif not self.quiet:
-            width = None if sys.stdout.isatty() else 140
-            console = Console(width=width, highlight=False, markup=False)
-            for table in tables:
+            seen = sys.stdout.isatty()
+            console = Console(
+                width=None if seen else 140, highlight=False, markup=False
+            )
+            for k, table in enumerate(tables):
+                if k:
+                    console.print()
                 console.print(table)
             if note:
-                console.print(note, soft_wrap=True)
+                console.print(note, soft_wrap=not seen)  # a log has no width
 
 
 @contextlib.contextmanager
@@ -154,9 +158,15 @@ class Clock:
         return dict(self._moves).get(str(move))
 
 
-def new_table(*columns: str) -> Table:
-    """An empty table without rules, its last column the one that is folded."""
-    table = Table(*columns, box=None, header_style="bold", pad_edge=False)
+def new_table(*columns: str, numbers: bool = False) -> Table:
+    """An empty table without rules, its last column the one that is folded.
+
+    `numbers`: all columns but the first are narrow ones of numbers.
+    """
+    gap = 1 if numbers else 2
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, gap, 0, 0))
+    for k, name in enumerate(columns):
+        table.add_column(name, justify="right" if numbers and k else "left")
     table.columns[-1].overflow = "fold"
     return table
 
@@ -191,28 +201,31 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
     }
 
 
-def keyframe_table(record: Mapping[str, Any]) -> Table:
-    """The keyframes of a record, a row each."""
-    table = new_table(
-        "move", "method", "iter", "s", "cost", "", "d [mm] of each contact",
-        "CoM [mm]", "push", "limit",
-    )  # fmt: skip
-    for k in record["keyframes"]:
-        d = " ".join(f"{s} {1000 * x:.0f}" for s, x in k["projected_distance"].items())
+def keyframe_tables(record: Mapping[str, Any]) -> list[Table]:
+    """The keyframes of a record: how each was found, and where its contacts are."""
+    found = new_table(
+        "move", "iter", "time [s]", "cost", "after", "CoM [mm]", "push", "limit"
+    )
+    keys = record["keyframes"]
+    for k in keys:
         com = k["com_margin"]
-        table.add_row(
+        found.add_row(
             k["move"],
-            k["method"],
             str(k["iterations"]),
-            "" if k["seconds"] is None else f"{k['seconds']:.2f}",
+            "-" if k["seconds"] is None else f"{k['seconds']:.2f}",
             f"{k['cost_before']:.3f}",
             f"{k['cost_after']:.3f}",
-            d,
             "-" if com is None else f"{1000 * com:.0f}",
             f"{k['equilibrium_margin']:.2f}",
             k["limiting"] or "-",
         )
-    return table
+    surfaces = list(dict.fromkeys(s for k in keys for s in k["projected_distance"]))
+    distances = new_table("projected distance [mm]", *surfaces, numbers=True)
+    for k in keys:
+        d = k["projected_distance"]
+        cells = (f"{1000 * d[s]:.0f}" if s in d else "" for s in surfaces)
+        distances.add_row(k["move"], *cells)
+    return [found, distances]
 
 
 def replanned_record(found: clamber.Replanned) -> dict[str, Any]:
@@ -235,6 +248,12 @@ def outcome(plan: clamber.Plan) -> str:
     missed = [s.reason for s in plan.skipped if s.missed]
     why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
     return f"the robot cannot do it: {why}"
+
+
+def closing(note: str, folder: Path, well: bool) -> str:
+    """The last line: how it ended, where the files are, and what to look at."""
+    look = "" if well else f"; `clamber report {folder}` shows how far it came"
+    return f"{note}; the files are in {folder}{look}"
 
 
 def skipped_tables(plan: clamber.Plan) -> list[Table]:
@@ -309,7 +328,7 @@ def conclude(
     else:
         wrong = [n for n, c in criteria.items() if not c.ok]
         note = f"the robot did not make it ({', '.join(wrong) or 'nothing planned'})"
-    tables = [keyframe_table(planned)] if clock is not None else []
+    tables = keyframe_tables(planned) if clock is not None else []
     tables += skipped_tables(plan)
     if rollout is not None and rollout.events:
         felt = new_table("at [s]", "felt on the way")
@@ -317,5 +336,5 @@ def conclude(
             felt.add_row(f"{e.time:.2f}", e.text)
         tables.append(felt)
     tables += [table] if criteria else []
-    output.show(record, *tables, note=f"{note}; the files are in {folder}")
+    output.show(record, *tables, note=closing(note, folder, reached))
     return REACHED if reached else MISSED
