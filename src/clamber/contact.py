@@ -41,9 +41,8 @@ class Contact:
         edge: A flat surface rolled onto one of its four edges: the edge's index, and
             `position` is the middle of that edge. None while it lies flat.
         link: (4,) orientation of a round surface's link in the world where it touches
-        at
-            `position`; as the link turns, the surface rolls from there. None where the
-            contact is not a robot's posture yet.
+            at `position`; as the link turns, the surface rolls from there. None where
+            the contact is not a robot's posture yet.
     """
 
     surface: str
