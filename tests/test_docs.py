@@ -18,8 +18,10 @@ import importlib.util
 import io as text_io
 import os
 import re
+import runpy
 import shlex
 import shutil
+import sys
 import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -219,6 +221,11 @@ class Session:
                 exec(compile(words[2], "<docs>", "exec"), {})
                 code = 0
             else:
+                program, script, *arguments = words
+                assert program == "python", f"{program} is not run: a note must say so"
+                with pytest.MonkeyPatch.context() as patch:
+                    patch.setattr(sys, "argv", [script, *arguments])
+                    runpy.run_path(script, run_name="__main__")
                 code = 0
         return code, out.getvalue()
 
