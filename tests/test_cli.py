@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 import clamber
-from clamber import cli
+from clamber import cli, terminal
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
@@ -85,16 +85,19 @@ def test_version_is_that_of_the_package(
         (["climb", "--height", "-1"], "--height is -1.0; expected a positive length"),
         (["climb", "--height", "nan"], "--height is nan; expected a finite number"),
         (["climb", "--robot", "nobody"], "--robot is 'nobody'; expected a robot.yaml"),
-        (["climb", "--scene", "no.yaml"], "no.yaml expected a readable file"),
-        (["climb", "--scene", "a.yaml", "--height", "1"], "not both"),
+        (["climb", "--scene", "no.yaml"], "no.yaml: expected a readable file"),
+        (["climb", "--scene", "a.yaml", "--height", "1"], "one of them alone"),
         (["replan"], "SEQUENCE"),
-        (["replan", "no.json"], "no.json expected a readable file"),
-        (["replan", "no", "--from", "3"], "no expected a run folder"),
+        (["replan", "no.json"], "no.json: expected a readable file"),
+        (["replan", "no", "--from", "3"], "no: expected a run folder"),
         (["climb", "--search.tries", "-1"], "--search.tries is -1; expected 0 or more"),
-        (["scene", "no.yaml"], "no.yaml expected a readable file"),
+        (["scene", "no.yaml"], "no.yaml: expected a readable file"),
         (["robot", "check", "nobody.urdf"], "expected a robot.yaml"),
-        (["sweep", "no.yaml"], "no.yaml expected a readable file"),
-        (["sweep", "a.yaml", "--workers", "1", "--scheduler", "tcp://b:1"], "not both"),
+        (["sweep", "no.yaml"], "no.yaml: expected a readable file"),
+        (
+            ["sweep", "a.yaml", "--workers", "1", "--scheduler", "tcp://b:1"],
+            "one of them",
+        ),
         (["sweep", "no.yaml", "--workers", "0"], "--workers is 0; expected 1 or more"),
     ],
 )
@@ -184,7 +187,7 @@ def test_the_flags_of_planning_are_fields_of_its_options():
 
 def test_progress_on_a_log_is_one_line_for_each_tenth():
     log = io.StringIO()
-    report = cli._lines(Console(file=log, width=80))
+    report = terminal.progress_lines(Console(file=log, width=80))
     for k in range(200):
         report("plan", k / 200, f"move {k}")
     report("simulate", 1.0, "")
@@ -197,7 +200,7 @@ def test_progress_on_a_log_is_one_line_for_each_tenth():
 def test_progress_on_a_terminal_shows_stage_share_and_time_left():
     screen = io.StringIO()
     console = Console(file=screen, width=100, force_terminal=True)
-    with cli._bars(console) as report:
+    with terminal.progress_bars(console) as report:
         report("plan", 0.0, "LHand")
         report("plan", 0.5, "[RHand]")
         report("simulate", 0.2, "")
@@ -319,9 +322,12 @@ def test_each_move_has_its_row_with_figures_and_seconds(
     assert cli.main(["climb"]) == 0
     rows = capsys.readouterr().out.splitlines()
     row = next(r for r in rows if r.startswith("air -> LHand on table"))
-    for word in ("direct", "14", "0.03", "0.805", "0.125", "LHand 42", "31", "0.57"):
+    for word in ("14", "0.03", "0.805", "0.125", "31", "0.57", "LKneeSag"):
         assert word in row
-    assert "LKneeSag" in row
+    head = next(r for r in rows if r.startswith("projected distance [mm]"))
+    row = next(r for r in rows[rows.index(head) :] if r.startswith("air -> LHand"))
+    assert row.rstrip().endswith(" 42")
+    assert head.index("LHand") < row.index(" 42") < head.index("LHand") + len("LHand")
     assert cli.main(["climb", "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)["keyframes"]
     assert first["move"] == "start"
@@ -736,9 +742,9 @@ def test_render_passes_on_what_is_asked(drawn: list[tuple]):
     [
         (["--video", "--sheet"], "one of them"),
         (["--frame", "1", "--video"], "one of them"),
-        (["--transparent", "--sheet"], "--transparent with --frame"),
-        (["--camera", "top"], "with --video, --sheet or --frame"),
-        (["--out", "x.png"], "with --video, --sheet or --frame"),
+        (["--transparent", "--sheet"], "--transparent: give --frame too"),
+        (["--camera", "top"], "give --video, --sheet or --frame too"),
+        (["--out", "x.png"], "give --video, --sheet or --frame too"),
         (
             ["--frame", "1", "--size", "huge"],
             "--size is 'huge'; expected such as 1080p",
@@ -836,7 +842,7 @@ def test_what_cannot_be_learned_from_is_said_in_a_sentence(
         ([str(broken)], ["broken.json", "whole JSON"]),
         ([str(learned / "policy.json")], ["policy.json", "expected"]),
         ([str(learned), "--out", str(learned / "policy.txt")], ["policy.txt", ".json"]),
-        ([], ["at least one demonstration"]),
+        ([], ["name at least one, such as crossing"]),
     ):
         assert cli.main(["learn", *arguments, "--quiet"]) == cli.BAD_INPUT
         error = capsys.readouterr().err

@@ -440,7 +440,7 @@ def test_legs_that_are_bent_otherwise_stand_on_the_ground_all_the_same(
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"RElbow": 0.1}, "RElbow expected a joint of"),
+        ({"RElbow": 0.1}, "RElbow: expected a joint of"),
         ({"RElbj": None}, "RElbj is 'nothing'"),
         ({"RElbj": 1.0}, "RElbj is 1.0; expected -2.356 to 0 rad"),
         ({"RElbj": float("nan")}, "RElbj is nan"),
@@ -456,7 +456,7 @@ def test_a_measured_posture_that_cannot_be_is_refused(
 
 def test_a_joint_that_was_not_measured_is_named(run: Path, home: dict[str, float]):
     del home["LAnkLat"]
-    with pytest.raises(InputError, match="LAnkLat expected an angle of every joint"):
+    with pytest.raises(InputError, match="LAnkLat: expected an angle of every joint"):
         export.load_motion(run, rate=50, lead_in=home)
 
 
@@ -514,9 +514,9 @@ def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, to):
         ({"to": "csv", "rate": 0}, "--rate is 0"),
         ({"to": "csv", "rate": 300}, "--rate is 300; expected a divisor of 1000"),
         ({"to": "csv", "rate": 2000}, "--rate is 2000"),
-        ({"to": "csv", "layout": "mjlab"}, "--layout with --to npz alone"),
+        ({"to": "csv", "layout": "mjlab"}, "it goes with --to npz"),
         ({"to": "npz", "layout": "gmr"}, "expected one of mjlab, holosoma"),
-        ({"to": "csv", "lead_in": "nowhere.yaml"}, "nowhere.yaml expected a readable"),
+        ({"to": "csv", "lead_in": "nowhere.yaml"}, "nowhere.yaml: expected a readable"),
         ({"to": "csv", "out": "no/such/folder/a.csv"}, "--out is 'no/such/folder"),
     ],
 )
@@ -525,7 +525,7 @@ def test_what_cannot_be_exported_is_said_in_one_sentence(
 ):
     with pytest.raises(InputError) as refusal:
         clamber.export_run(run, **options)
-    assert said in str(refusal.value).replace(":", "")
+    assert said in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 

@@ -324,7 +324,7 @@ def test_a_table_cut_short_says_after_which_row(tmp_path, suffix):
     lines = good(suffix)[0].splitlines(keepends=True)
     (tmp_path / f"a.{suffix}").write_bytes(b"".join(lines[:-7]))
     rows = len(short().t)
-    said = f"line {len(lines) - 6} expected {rows} rows.* ends after {rows - 7}$"
+    said = f"line {len(lines) - 6}: expected {rows} rows.* ends after {rows - 7}$"
     with pytest.raises(InputError, match=said):
         read_points(tmp_path / f"a.{suffix}")
 

@@ -236,7 +236,7 @@ def edit(change: Callable[[dict], object]) -> Callable[[str], str]:
         (lambda text: "[1]", "is 'list'; expected an object"),
         (edit(lambda c: c.update(version=2)), "version is 2; expected version 1"),
         (edit(lambda c: c.pop("version")), "version is 'absent'; expected version 1"),
-        (edit(lambda c: c.pop("stances")), "stances expected a value"),
+        (edit(lambda c: c.pop("stances")), "stances: expected a value"),
         (edit(lambda c: c.update(stances=[])), "stances"),
         (
             edit(lambda c: c["stances"][1]["contacts"][0].update(position=[0, "a", 0])),
@@ -272,9 +272,9 @@ def test_a_mistake_in_a_sequence_is_named_with_its_file_and_field(
 
 
 def test_a_missing_sequence_is_one_sentence(tmp_path: Path):
-    with pytest.raises(InputError, match=r"no\.json expected a readable file"):
+    with pytest.raises(InputError, match=r"no\.json: expected a readable file"):
         io.load_sequence(tmp_path / "no.json")
-    with pytest.raises(InputError, match=r"sequence\.json expected a readable file"):
+    with pytest.raises(InputError, match=r"sequence\.json: expected a readable file"):
         io.load_sequence(tmp_path)
 
 
@@ -438,13 +438,13 @@ def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path
         (
             "plan.json",
             edit(lambda c: c["robot"]["limbs"]["left_arm"].update(root="Wing")),
-            "scene.xml expected the robot and the boxes of plan.json as MJCF",
+            "scene.xml: expected the robot and the boxes of plan.json as MJCF",
         ),
-        ("scene.xml", lambda text: text[:500], "scene.xml expected the robot"),
+        ("scene.xml", lambda text: text[:500], "scene.xml: expected the robot"),
         (
             "scene.xml",
             lambda text: text.replace('name="box"', 'name="crate"'),
-            "scene.xml expected the robot and the boxes",
+            "scene.xml: expected the robot and the boxes",
         ),
     ],
 )
@@ -470,7 +470,7 @@ def test_a_missing_file_of_a_plan_is_named(name: str, saved: Path, tmp_path: Pat
 
 
 def test_a_folder_that_is_none_is_named(tmp_path: Path):
-    with pytest.raises(InputError, match="nowhere expected a run folder"):
+    with pytest.raises(InputError, match="nowhere: expected a run folder"):
         io.load_plan(tmp_path / "nowhere")
 
 
@@ -479,7 +479,9 @@ def test_a_broken_trajectory_is_named(plan: Plan, saved: Path, tmp_path: Path):
     whole = (saved / "trajectory.npz").read_bytes()
     for content in (b"", b"no zip", whole[: len(whole) // 2]):
         path.write_bytes(content)
-        with pytest.raises(InputError, match=r"trajectory\.npz expected a whole \.npz"):
+        with pytest.raises(
+            InputError, match=r"trajectory\.npz: expected a whole \.npz"
+        ):
             io.load_trajectory(path, plan.world)
     with path.open("wb") as stream:
         np.save(stream, np.zeros(3))
@@ -494,11 +496,11 @@ def test_a_broken_trajectory_is_named(plan: Plan, saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match="joint_names is"):
         io.load_trajectory(path, plan.world)
     np.savez(path, **{**arrays, "qvel": arrays["qvel"] * np.nan})
-    with pytest.raises(InputError, match="qvel expected finite numbers"):
+    with pytest.raises(InputError, match="qvel: expected finite numbers"):
         io.load_trajectory(path, plan.world)
     del arrays["tau"]
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match="tau expected an array"):
+    with pytest.raises(InputError, match="tau: expected an array"):
         io.load_trajectory(path, plan.world)
 
 
@@ -580,7 +582,7 @@ def test_plain_mujoco_replays_the_rollout(
 
 
 def test_a_broken_rollout_is_named(plan: Plan, rollout: Rollout, tmp_path: Path):
-    with pytest.raises(InputError, match=r"rollout\.npz expected a whole"):
+    with pytest.raises(InputError, match=r"rollout\.npz: expected a whole"):
         io.load_rollout(tmp_path)
     io.save_rollout(plan, replace(rollout, qpos=rollout.qpos[1:]), tmp_path)
     with pytest.raises(InputError, match="shape of qpos"):
@@ -603,5 +605,5 @@ def test_a_verdict_survives_the_disk(tmp_path: Path):
         "ok": False,
     }
     (tmp_path / "verdict.json").write_text('{"version": 1}')
-    with pytest.raises(InputError, match="reached expected a value"):
+    with pytest.raises(InputError, match="reached: expected a value"):
         io.load_verdict(tmp_path)

@@ -70,6 +70,7 @@ LAYERS = [
     "report",
     "view",
     "",  # the package itself: its public names
+    "terminal",
     "cli",
 ]
 

@@ -284,7 +284,7 @@ def test_a_robot_without_effort_limits_is_refused_by_name(proposed, tmp_path):
     (tmp_path / "robot.xml").write_text(proposal.mjcf)
     fields = {**proposal.fields, "effort": {}}
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(fields))
-    with pytest.raises(InputError, match=r"effort\.\w+ expected its largest torque"):
+    with pytest.raises(InputError, match=r"effort\.\w+: expected its largest torque"):
         load_robot(tmp_path / "robot.yaml")
 
 

@@ -389,7 +389,7 @@ def test_a_picture_that_is_none_is_left_out(run: Path):
     picture.write_bytes(b"<svg onload='alert(1)'>")
     record = report.run_record(run)
     assert record["picture"] is None
-    assert record["missing"] == ["demonstration.png expected a whole PNG picture"]
+    assert record["missing"] == ["demonstration.png: expected a whole PNG picture"]
 
 
 @pytest.mark.parametrize("content", [None, "{", '{"version": 1}'])
@@ -400,7 +400,7 @@ def test_a_folder_with_nothing_in_it_is_one_sentence(
         (tmp_path / "plan.json").write_text(content)
     assert cli.main(["report", str(tmp_path)]) == 2
     err = capsys.readouterr().err
-    assert "expected a run folder with plan.json or verdict.json" in err
+    assert "expected a run folder with a whole plan.json or verdict.json" in err
     assert "Traceback" not in err
     with pytest.raises(InputError, match="expected a run folder"):
         report.write_report(tmp_path / "nowhere")

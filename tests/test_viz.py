@@ -297,7 +297,7 @@ def test_a_backend_that_does_not_work_is_not_chosen(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_folder_without_a_plan_is_not_drawn(tmp_path: Path):
-    with pytest.raises(InputError, match=r"plan\.json expected a readable file"):
+    with pytest.raises(InputError, match=r"plan\.json: expected a readable file"):
         viz.render_run(tmp_path)
 
 

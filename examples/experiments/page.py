@@ -49,7 +49,10 @@ def page(runs: Path, pictures: Path) -> str:
         ]
         parts.append(f"## {spec.about}\n")
         parts.append("\n".join(comment) + "\n")
-        parts.append(f"    clamber sweep examples/experiments/{name}.yaml\n")
+        parts.append(
+            "<!-- read only: tens of climbs, which are minutes of computing -->\n"
+            f"```sh\nclamber sweep examples/experiments/{name}.yaml\n```\n"
+        )
         if len(rows) < wanted:
             parts.append(f"So far {len(rows)} of {wanted} runs.\n")
         parts.append(table(summarise(spec, rows), search=spec.search is not None))

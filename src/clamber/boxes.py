@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from clamber.description import compile_description, read_description
-from clamber.errors import InputError
+from clamber.errors import InputError, unreadable
 from clamber.se3 import matrix_from_rpy
 
 NAME = r"^[A-Za-z][A-Za-z0-9_]*$"  # of a box
@@ -66,8 +66,10 @@ def read_obj(path: Path, scale: float = 1.0, up: str = "z") -> list[DrawnBox]:
     groups: list[tuple[str | None, list[list[float]]]] = [(None, [])]
     try:
         lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError("a readable OBJ file", source=path) from e
+    except OSError as e:
+        raise unreadable(path, e) from e
+    except UnicodeDecodeError as e:
+        raise InputError("an OBJ file, in UTF-8", source=path) from e
     for number, line in enumerate(lines, start=1):
         word, *rest = line.split() or [""]
         if word in ("o", "g") and rest:

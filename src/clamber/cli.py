@@ -5,7 +5,7 @@ functions in order, as `clamber.<name>`: those are imported on first use, so tha
 `--help` answers at once. Progress goes to stderr, results to stdout.
 
 Exit codes: 0 the robot made it (or the command did its work), 1 it did not, 2 bad
-input, 130 interrupted.
+input, 130 interrupted, 141 nobody reads the output any more.
 """
 
 from __future__ import annotations
@@ -14,38 +14,47 @@ import contextlib
 import io as text_io
 import json
 import math
+import os
 import re
 import socket
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
 
 import clamber
 from clamber.disturbance import Disturbance
 from clamber.errors import ClamberError, InputError
+from clamber.terminal import (
+    BAD_INPUT,
+    INTERRUPTED,
+    MISSED,
+    REACHED,
+    READER_GONE,
+    Clock,
+    Output,
+    Report,
+    closing,
+    conclude,
+    keyframe_tables,
+    new_table,
+    outcome,
+    plan_record,
+    policy_tables,
+    replanned_record,
+    skipped_tables,
+)
 
-REACHED, MISSED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 DEFAULT_HEIGHT = 0.275  # [m] of the box where no scene is given
 DESCRIPTION = (
     "Turns a recording of a person climbing over an obstacle into a motion that a "
     "humanoid robot executes in physics. Try: clamber climb --video"
 )
-Report = Callable[[str, float, str], None]
+SHELLS = ("bash", "zsh")
 
 
 def _default(module: str, record: str, name: str) -> Any:
@@ -55,81 +64,6 @@ def _default(module: str, record: str, name: str) -> Any:
             getattr(import_module(f"clamber.{module}"), record)(), name
         )
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Output:
-    """How results are shown."""
-
-    json: bool = False
-    """Print the result as one JSON object."""
-    quiet: bool = False
-    """No progress, no table: files and exit code only."""
-
-    @contextlib.contextmanager
-    def progress(self) -> Iterator[Report]:
-        """Yield `report(stage, share done, note)`; it draws on stderr."""
-        console = Console(stderr=True)
-        if self.quiet:
-            yield lambda stage, done, note: None
-        elif console.is_terminal:
-            with _bars(console) as report:
-                yield report
-        else:
-            yield _lines(console)
-
-    def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
-        """Print one JSON object, or tables and a closing sentence, on stdout."""
-        if self.json:
-            sys.stdout.write(
-                json.dumps({"version": 1, **record}, allow_nan=False) + "\n"
-            )
-        elif not self.quiet:
-            width = None if sys.stdout.isatty() else 140
-            console = Console(width=width, highlight=False, markup=False)
-            for table in tables:
-                console.print(table)
-            if note:
-                console.print(note, soft_wrap=True)
-
-
-@contextlib.contextmanager
-def _bars(console: Console) -> Iterator[Report]:
-    """One bar for each stage, with its share and the time left."""
-    columns = (
-        TextColumn("{task.description:<10}"),
-        BarColumn(bar_width=24),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-    )
-    with Progress(*columns, console=console) as bars:
-        tasks = {}
-
-        def report(stage: str, done: float, note: str) -> None:
-            if stage not in tasks:
-                for earlier in tasks.values():
-                    bars.update(earlier, completed=1.0, note="")
-                tasks[stage] = bars.add_task(stage, total=1.0, note=note)
-            bars.update(tasks[stage], completed=done, note=note)
-
-        yield report
-        for task in tasks.values():
-            bars.update(task, completed=1.0, note="")
-
-
-def _lines(console: Console) -> Report:
-    """One line for each tenth of a stage, for logs."""
-    shown: dict[str, int] = {}
-
-    def report(stage: str, done: float, note: str) -> None:
-        tenth = int(10 * done)
-        if shown.get(stage, -1) < tenth:
-            shown[stage] = tenth
-            line = f"{stage} {100 * done:3.0f} % {note}".rstrip()
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-    return report
 
 
 Flat = tyro.conf.OmitArgPrefixes
@@ -256,7 +190,7 @@ def _scene(height: float | None, path: Path | None) -> clamber.Scene:
     from clamber.job import scene_of
 
     if path is not None and height is not None:
-        raise InputError("--height or --scene, not both")
+        raise InputError("--height, --scene: give one of them alone")
     return scene_of(DEFAULT_HEIGHT if height is None else height, path)
 
 
@@ -312,7 +246,7 @@ class ClimbCommand:
             _save_timings(folder, clock)
         if missing and not self.output.quiet:
             sys.stderr.write(f"clamber: {missing}\n")
-        return _conclude(self.output, folder, plan, done, clock)
+        return conclude(self.output, folder, plan, done, clock)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,9 +274,12 @@ class ContactsCommand:
             sequence = clamber.detect_contacts(demo)
             folder = clamber.new_run_folder(self.out, "contacts")
             clamber.save_sequence(sequence, folder / "sequence.json")
-        table = _table("stance", "region", "from [s]", "to [s]", "contacts")
+        table = new_table("stance", "region", "from [s]", "to [s]", "contacts")
         for i, stance in enumerate(sequence.stances):
-            on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
+            on = ", ".join(
+                f"{' '.join(surfaces)} on {support}"
+                for support, surfaces in _by_support(stance).items()
+            )
             t0, t1 = sequence.t[i], sequence.t[i + 1]
             table.add_row(str(i), stance.region, f"{t0:.2f}", f"{t1:.2f}", on)
         record = {
@@ -353,6 +290,14 @@ class ContactsCommand:
         note = "\n".join([*demo.notes, f"the sequence is in {folder}"])
         self.output.show(record, table, note=note)
         return REACHED
+
+
+def _by_support(stance: clamber.Stance) -> dict[str, list[str]]:
+    """The surfaces on each support."""
+    found: dict[str, list[str]] = {}
+    for c in stance.contacts:
+        found.setdefault(c.support, []).append(c.surface)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -378,9 +323,11 @@ class PlanCommand:
             report = clock.watching(show)
             with self.world.blamed():
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
-        record = {"out": str(folder), **_plan_record(plan, clock)}
-        note = f"{_outcome(plan)}; the files are in {folder}"
-        self.output.show(record, _keyframes(record), *_skipped(plan), note=note)
+        record = {"out": str(folder), **plan_record(plan, clock)}
+        note = closing(outcome(plan), folder, plan.complete)
+        self.output.show(
+            record, *keyframe_tables(record), *skipped_tables(plan), note=note
+        )
         return REACHED if plan.complete else MISSED
 
 
@@ -435,19 +382,20 @@ class ReplanCommand:
             clamber.save_plan(found.best.plan, folder)
             save_replanned(found, folder)
         if self.output.json:  # these two fields and no other
-            sys.stdout.write(json.dumps(_replanned_record(found)) + "\n")
+            sys.stdout.write(json.dumps(replanned_record(found)) + "\n")
             return REACHED if found.best.stable else MISSED
-        table = _table("surfaces", "stable", "cost [m]", "moves", "why not")
+        table = new_table("surfaces", "stable", "cost [m]", "moves", "why not")
         for r in found.ranked:
             table.add_row(
                 ", ".join(r.surfaces) or "as demonstrated",
                 "yes" if r.stable else "no",
                 f"{r.cost:.3f}",
                 str(len(r.plan.paths)),
-                "" if r.stable else _outcome(r.plan),
+                "" if r.stable else outcome(r.plan),
             )
-        note = "the best one is planned" if found.best.stable else described(found)
-        self.output.show({}, table, note=f"{note}; the files are in {folder}")
+        stable = found.best.stable
+        note = "the best one is planned" if stable else described(found)
+        self.output.show({}, table, note=closing(note, folder, stable))
         return REACHED if found.best.stable else MISSED
 
     def _rest(self, begin: str) -> int:
@@ -467,26 +415,17 @@ class ReplanCommand:
             folder = clamber.new_run_folder(self.out, "replan")
             clamber.save_sequence(plan.sequence, folder / "sequence.json")
             clamber.save_plan(plan, folder)
-        record = {"out": str(folder), "made": now.made, **_plan_record(plan)}
+        record = {"out": str(folder), "made": now.made, **plan_record(plan)}
         on = ", ".join(f"{c.surface} on {c.support}" for c in now.contacts)
-        note = (
-            f"from {on}, {now.made} steps made: {_outcome(plan)}; the files are in"
-            f" {folder}"
+        note = f"from {on}, {now.made} steps made: {outcome(plan)}"
+        tables = keyframe_tables(record) if plan.keyframes else []
+        self.output.show(
+            record,
+            *tables,
+            *skipped_tables(plan),
+            note=closing(note, folder, plan.complete),
         )
-        tables = [_keyframes(record)] if plan.keyframes else []
-        self.output.show(record, *tables, *_skipped(plan), note=note)
         return REACHED if plan.complete else MISSED
-
-
-def _replanned_record(found: clamber.Replanned) -> dict[str, Any]:
-    """Differences and plans, the best first."""
-    return {
-        "differences": [list(d) for d in found.differences],
-        "plans": [
-            {"surfaces": list(r.surfaces), "cost": r.cost, "stable": r.stable}
-            for r in found.ranked
-        ],
-    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -542,7 +481,7 @@ class TraverseCommand:
             _save_timings(folder, clock)
         if missing and not self.output.quiet:
             sys.stderr.write(f"clamber: {missing}\n")
-        return _conclude(self.output, folder, plan, done, clock)
+        return conclude(self.output, folder, plan, done, clock)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -565,7 +504,7 @@ class SimulateCommand:
                 plan, self.run_folder, clock.watching(show), self.scene
             )
             _save_timings(self.run_folder, clock)
-        return _conclude(self.output, self.run_folder, plan, done)
+        return conclude(self.output, self.run_folder, plan, done)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -593,7 +532,7 @@ class LearnCommand:
         from clamber.policy_plots import save_pictures
 
         if not self.demonstrations:
-            raise InputError("at least one demonstration, such as crossing")
+            raise InputError("no demonstration: name at least one, such as crossing")
         if self.out is not None and self.out.suffix != ".json":
             raise InputError(
                 "a file that ends in .json", source="--out", value=str(self.out)
@@ -618,7 +557,7 @@ class LearnCommand:
         }
         tables, notes = [], [*policy.notes]
         for k, one in enumerate((policy, *policy.secondary)):
-            tables += _policy_tables(one, f"secondary {k}" if k else "")
+            tables += policy_tables(one, f"secondary {k}" if k else "")
             notes += one.notes if k else ()
             if k:
                 notes.append(f"secondary {k}: {', '.join(one.sources)}")
@@ -633,33 +572,6 @@ def _sequence(name: str) -> clamber.ContactSequence:
     if path.suffix == ".json" or path.is_dir():
         return clamber.load_sequence(path)
     return clamber.detect_contacts(clamber.load_demo(name))
-
-
-def _policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
-    """Options, and how the pelvis is held."""
-    options = _table(
-        " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
-        "until",
-    )  # fmt: skip
-    for o in policy.options:
-        options.add_row(
-            o.name, o.region, ", ".join(o.surfaces), str(o.repeats),
-            " ".join(o.initiation), o.termination,
-        )  # fmt: skip
-    pelvis = _table("pelvis", "angle", "mean [deg]", "sigma [deg]", "imposed [deg]")
-    for place, d in (("near edge", policy.near_edge), ("over top", policy.over_top)):
-        for k, angle in enumerate(("roll", "pitch", "yaw")):
-            imposed = d.imposed[k]
-            pelvis.add_row(
-                "" if k else f"{place} ({d.samples})",
-                angle,
-                f"{math.degrees(d.mean[k]):.1f}",
-                f"{math.degrees(d.sigma[k]):.1f}",
-                "-"
-                if imposed is None
-                else " to ".join(f"{math.degrees(x):.1f}" for x in imposed),
-            )
-    return [options, pelvis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -705,13 +617,13 @@ class RenderCommand:
         """One of the three, and flags that go with it."""
         asked = [self.video, self.sheet, self.frame is not None]
         if sum(asked) > 1:
-            raise InputError("--video, --sheet or --frame, one of them")
+            raise InputError("--video, --sheet, --frame: give one of them alone")
         if self.transparent and self.frame is None:
-            raise InputError("--transparent with --frame alone")
+            raise InputError("--transparent: give --frame too, or leave it out")
         special = self.camera != "corner" or self.size or self.out
         if special and not any(asked):
             raise InputError(
-                "--camera, --size and --out with --video, --sheet or --frame"
+                "--camera, --size, --out: give --video, --sheet or --frame too"
             )
 
     def _draw(self, report: Report) -> list[Path]:
@@ -935,7 +847,7 @@ class SceneCommand:
     def run(self) -> int:
         """Scene file to a table of its supports."""
         scene = clamber.load_scene(self.file)
-        table = _table("support", "centre [m]", "slope [deg]", "friction", "")
+        table = new_table("support", "centre [m]", "slope [deg]", "friction", "")
         supports = []
         faults = clamber.check_scene(scene)
         for s in scene.supports:
@@ -991,14 +903,16 @@ class RobotCommand:
             out = out or Path("robots") / proposal.name
             if out.exists() and (not out.is_dir() or any(out.iterdir())):
                 raise InputError(
-                    "a new or empty folder", source="--out", value=str(out)
+                    "a new or empty folder",
+                    source="--out",
+                    value=str(out),
                 )
             out = clamber.new_run_folder(out, "robot")
             clamber.save_proposal(proposal, out)
             path, notes = str(out / "robot.yaml"), list(proposal.notes)
         robot = clamber.load_robot(path)
         found = clamber.check_robot(robot)
-        table = _table("limb", "from", "over", "to", "surfaces", "length [m]")
+        table = new_table("limb", "from", "over", "to", "surfaces", "length [m]")
         for limb in robot.limbs.values():
             table.add_row(
                 limb.name,
@@ -1063,7 +977,7 @@ class SweepCommand:
         if self.workers is not None and self.workers < 1:
             raise InputError("1 or more", source="--workers", value=self.workers)
         if self.workers is not None and self.scheduler is not None:
-            raise InputError("--workers or --scheduler, not both")
+            raise InputError("--workers, --scheduler: give one of them alone")
         spec = experiment.load_spec(self.spec)
         folder = self.out or Path("runs") / self.spec.stem
         sweep.check_inputs(spec)
@@ -1086,7 +1000,7 @@ class SweepCommand:
             )
             return INTERRUPTED
         summaries = curves.summarise(spec, rows)
-        table = _table(
+        table = new_table(
             "controller", "to", "runs", "reached", "95 % interval", "half at",
             "95 % interval",
         )  # fmt: skip
@@ -1172,178 +1086,6 @@ def _save_timings(folder: Path, clock: Clock) -> None:
     save_timings(folder, {k: v for k, v in stages if k not in finer})
 
 
-def _table(*columns: str) -> Table:
-    table = Table(*columns, box=None, header_style="bold", pad_edge=False)
-    table.columns[-1].overflow = "fold"
-    return table
-
-
-class Clock:
-    """Seconds by stage and by move, from what the stages report of themselves."""
-
-    def __init__(self) -> None:
-        """Nothing has run yet."""
-        self._stages: dict[str, float] = {}
-        self._moves: list[tuple[str, float]] = []
-
-    def watching(self, report: Report) -> Report:
-        """A report that also takes the time."""
-        began: dict[tuple[str, float, str], float] = {}
-        last: tuple[str, float, str] | None = None
-
-        def timed(stage: str, done: float, note: str) -> None:
-            nonlocal last
-            now = time.perf_counter()
-            if last is not None:
-                spent = now - began[last]
-                self._stages[last[0]] = self._stages.get(last[0], 0.0) + spent
-                if last[0] == "plan":
-                    self._add(last, spent)
-            last = (stage, done, note)
-            began[last] = now
-            report(stage, done, note)
-
-        return timed
-
-    def _add(self, step: tuple[str, float, str], spent: float) -> None:
-        """A move that is tried again, for a later one's sake, costs both times."""
-        for i, (note, seconds) in enumerate(self._moves):
-            if note == step[2]:
-                self._moves[i] = (note, seconds + spent)
-                return
-        self._moves.append((step[2], spent))
-
-    def stages(self) -> dict[str, float]:
-        """Seconds by stage."""
-        return dict(self._stages)
-
-    def of(self, move: object) -> float | None:
-        """Seconds that a move took; None where it was not watched."""
-        return dict(self._moves).get(str(move))
-
-
-def _plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any]:
-    """What `--json` says of a plan; costs and margins are those of `plan.json`."""
-    moves = [None, *(p.transition.move for p in plan.paths)]
-    keyframes = []
-    for i, key in enumerate(plan.keyframes):
-        move = moves[i] if i < len(moves) else None
-        keyframes.append(
-            {
-                "move": "start" if i == 0 else str(move),
-                "method": key.method,
-                "iterations": key.iterations,
-                "seconds": None if clock is None or i == 0 else clock.of(move),
-                "cost_before": key.cost_before,
-                "cost_after": key.cost_after,
-                "projected_distance": {
-                    c.contact.surface: c.projected_distance for c in key.contacts
-                },
-                "com_margin": key.com_margin if math.isfinite(key.com_margin) else None,
-                "equilibrium_margin": key.equilibrium.margin,
-                "limiting": key.equilibrium.limiting,
-            }
-        )
-    return {
-        "complete": plan.complete,
-        "instead": plan.instead,
-        "keyframes": keyframes,
-        "skipped": [{"stance": s.stance, "reason": s.reason} for s in plan.skipped],
-    }
-
-
-def _keyframes(record: Mapping[str, Any]) -> Table:
-    """The keyframes of a record, a row each."""
-    table = _table(
-        "move", "method", "iter", "s", "cost", "", "d [mm] of each contact",
-        "CoM [mm]", "push", "limit",
-    )  # fmt: skip
-    for k in record["keyframes"]:
-        d = " ".join(f"{s} {1000 * x:.0f}" for s, x in k["projected_distance"].items())
-        com = k["com_margin"]
-        table.add_row(
-            k["move"],
-            k["method"],
-            str(k["iterations"]),
-            "" if k["seconds"] is None else f"{k['seconds']:.2f}",
-            f"{k['cost_before']:.3f}",
-            f"{k['cost_after']:.3f}",
-            d,
-            "-" if com is None else f"{1000 * com:.0f}",
-            f"{k['equilibrium_margin']:.2f}",
-            k["limiting"] or "-",
-        )
-    return table
-
-
-def _outcome(plan: clamber.Plan) -> str:
-    """One clause: planned to the end, or why not."""
-    if plan.complete:
-        return "; ".join(filter(None, (plan.instead, "planned to the last stance")))
-    if plan.instead:
-        return f"the robot cannot do it: {plan.instead}"
-    missed = [s.reason for s in plan.skipped if s.missed]
-    why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
-    return f"the robot cannot do it: {why}"
-
-
-def _skipped(plan: clamber.Plan) -> list[Table]:
-    """A table of the stances left out, where there are any."""
-    if not plan.skipped:
-        return []
-    table = _table("skipped stance", "because")
-    for s in plan.skipped:
-        table.add_row(str(s.stance), s.reason)
-    return [table]
-
-
-def _conclude(
-    output: Output,
-    folder: Path,
-    plan: clamber.Plan,
-    done: tuple[clamber.Rollout, clamber.Verdict] | None,
-    clock: Clock | None = None,
-) -> int:
-    """Show the verdict and where the files are; the exit code says the same."""
-    table = _table("criterion", "value", "limit", "")
-    rollout, verdict = (None, None) if done is None else done
-    criteria = {} if verdict is None else verdict.criteria
-    for name, c in criteria.items():
-        table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
-    reached = verdict is not None and verdict.reached
-    planned = _plan_record(plan, clock)
-    record = {
-        "out": str(folder),
-        "reached": reached,
-        "criteria": {
-            n: {"value": c.value, "limit": c.limit, "ok": c.ok}
-            for n, c in criteria.items()
-        },
-        "events": [] if rollout is None else [asdict(e) for e in rollout.events],
-        "stopped": "" if rollout is None else rollout.stopped,
-        **planned,
-    }
-    if reached:
-        note = "; ".join(filter(None, (plan.instead, "the robot made it")))
-    elif not plan.complete:
-        note = _outcome(plan)
-    elif rollout is not None and rollout.stopped:
-        note = f"the robot stopped on the way: {rollout.stopped}"
-    else:
-        wrong = [n for n, c in criteria.items() if not c.ok]
-        note = f"the robot did not make it ({', '.join(wrong) or 'nothing planned'})"
-    tables = [_keyframes(planned)] if clock is not None else []
-    tables += _skipped(plan)
-    if rollout is not None and rollout.events:
-        felt = _table("at [s]", "felt on the way")
-        for e in rollout.events:
-            felt.add_row(f"{e.time:.2f}", e.text)
-        tables.append(felt)
-    tables += [table] if criteria else []
-    output.show(record, *tables, note=f"{note}; the files are in {folder}")
-    return REACHED if reached else MISSED
-
-
 def _parse(args: Sequence[str]) -> Any:
     """Flags to a command; a wrong flag becomes one sentence instead of a box."""
     captured = text_io.StringIO()
@@ -1363,19 +1105,37 @@ def _parse(args: Sequence[str]) -> Any:
 
 
 def _sentence(box: str) -> str:
-    """The text of an error box, up to its first rule, on one line."""
-    rows = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
-    text = []
-    for row in rows:
-        if row and not row.strip("─"):
-            break
-        text.append(row)
-    words = " ".join(" ".join(text).split())
-    wrong = re.match(r"(.*): no type matching (.*) could be .* from (.*?)\.", words)
-    if wrong:
-        flag, kind, value = wrong.groups()
-        words = f"{flag}: {value}, expected {kind.removeprefix('{None}|')}"
-    return words or "flags as in --help"
+    """The text of an error box on one line: what is wrong, then which help to read.
+
+    Below its title a box, of lines or of plain dashes, has parts between rules.
+    """
+    parts = [""]
+    for line in box.splitlines()[1:]:
+        row = line.strip("│╭╮╰╯ ")
+        if row and not row.strip("─-"):
+            parts.append("")
+        else:
+            parts[-1] += f" {row}"
+    wrong, *rest = [" ".join(p.split()) for p in parts if p.strip()] or ["wrong flags"]
+    odd = re.match(r"(.*): no type matching (.*) could be .* from (.*?)\.", wrong)
+    if odd:
+        flag, kind, value = odd.groups()
+        wrong = f"{flag}: {value}, expected {kind.removeprefix('{None}|')}"
+    more = " ".join(rest)
+    meant = re.search(r"Perhaps you meant: (--[\w.-]+)", more)
+    if meant:
+        wrong += f", perhaps {meant[1]} is meant"
+    helped = re.search(r"For full helptext, \w+:? (clamber.*--help)", more)
+    return f"{wrong.rstrip('.')}; {helped[1] if helped else 'clamber --help'} says more"
+
+
+def _by_flag(error: InputError) -> InputError:
+    """A value that came from no file, under its name on the command line."""
+    from clamber.job import FLAGS
+
+    if error.source is not None or error.field not in FLAGS:
+        return error
+    return InputError(error.expected, source=f"--{error.field}", value=error.value)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -1388,10 +1148,29 @@ def main(args: Sequence[str] | None = None) -> int:
     if argv[: len(lead)] == lead:  # also before the command
         argv = argv[len(lead) :] + lead
     try:
+        if argv[:1] == ["--completion"]:
+            return _complete(argv[1:])
         return _parse(argv).run()
     except ClamberError as e:
-        sys.stderr.write(f"clamber: {e}\n")
+        error = _by_flag(e) if isinstance(e, InputError) else e
+        sys.stderr.write(f"clamber: {error}\n")
         return BAD_INPUT
     except KeyboardInterrupt:
         sys.stderr.write("clamber: interrupted; the files written so far are whole\n")
         return INTERRUPTED
+    except BrokenPipeError:  # `clamber ... | head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_GONE
+
+
+def _complete(shell: Sequence[str]) -> int:
+    """Print the script that makes a shell complete commands, flags and values."""
+    if len(shell) != 1 or shell[0] not in SHELLS:
+        raise InputError(
+            "bash or zsh, as in: source <(clamber --completion bash)",
+            source="--completion",
+            value=" ".join(shell) or "nothing",
+        )
+    with contextlib.suppress(SystemExit):  # the parser's way of having done its work
+        _parse(["--tyro-print-completion", shell[0]])
+    return REACHED

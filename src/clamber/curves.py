@@ -145,8 +145,8 @@ def save_curves(spec: Spec, rows: Rows, folder: Path) -> list[Path]:
 def draw_success(spec: Spec, rows: Rows, path: Path) -> Path:
     """Success against each factor: bins with intervals, of a search its curve too."""
     names = spec.factors if spec.search is None else [spec.search.factor]
-    across = min(len(names), 3)
-    down = -(-len(names) // across)
+    across = max(1, min(len(names), 3))  # seeds alone differ: an empty picture
+    down = max(1, -(-len(names) // across))
     size = (6.4 if across == 1 else 3.6 * across, 3.4 * down + 0.6)
     fig = Figure(figsize=size, layout="constrained")
     axes = fig.subplots(down, across, squeeze=False, sharey=True).ravel().tolist()

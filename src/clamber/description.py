@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError
+from clamber.errors import InputError, unreadable
 
 MAX_BYTES = 50_000_000  # of a description
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo loads
@@ -106,7 +106,7 @@ def _parse(path: Path) -> ElementTree.Element:
     try:
         content = path.read_bytes()
     except OSError as e:
-        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+        raise unreadable(path, e) from e
     if len(content) > MAX_BYTES:
         raise InputError(
             f"at most {MAX_BYTES // 1_000_000} MB", source=path, value=len(content)

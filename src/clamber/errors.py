@@ -40,9 +40,17 @@ class InputError(ClamberError):
             value,
         )
         where = ": ".join(str(x) for x in (source, field) if x is not None)
-        what = "" if value is None else f" is {value!r};"
+        what = ":" if value is None else f" is {value!r};"
         sentence = f"{where}{what} expected {expected}" if where else expected
         super().__init__(sentence)
+
+
+def unreadable(
+    path: object, error: OSError, then: str = "check the path"
+) -> InputError:
+    """A file that cannot be opened, why, and what to do then."""
+    why = error.strerror or "unreadable"
+    return InputError(f"a readable file ({why}); {then}", source=path)
 
 
 class Infeasible(ClamberError):

@@ -231,7 +231,7 @@ class Spec(_Strict):
         unknown = [f for f in (*self.base, *self.flags) if f not in FLAGS]
         if unknown:
             raise ValueError(
-                f"no such flag: {unknown[0]}; there are {', '.join(FLAGS)}"
+                f"flags of climb, not {unknown[0]}; there are {', '.join(FLAGS)}"
             )
         return self
 

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from clamber.errors import InputError, MissingDependency
-from clamber.io import ROLLOUT, load_plan, load_rollout, whole_file
+from clamber.io import NO_TRAJECTORY, ROLLOUT, load_plan, load_rollout, whole_file
 from clamber.model import Kinematics, World
 from clamber.pipeline import Plan
 from clamber.scene import read_yaml
@@ -124,7 +124,9 @@ def export_run(
         )
     if layout is not None and to != "npz":
         raise InputError(
-            "--layout with --to npz alone", source="--layout", value=layout
+            "no layout for this format: it goes with --to npz",
+            source="--layout",
+            value=layout,
         )
     if layout not in (None, *get_args(Layout)):
         raise InputError(
@@ -185,7 +187,10 @@ def load_motion(
         )
     plan = load_plan(folder)
     if plan.trajectory is None:
-        raise InputError("a plan that got as far as a trajectory", source=folder)
+        raise InputError(
+            NO_TRAJECTORY,
+            source=folder,
+        )
     rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
     motion = _sampled(plan, rollout, rate)
     if lead_in is None:

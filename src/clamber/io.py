@@ -37,7 +37,7 @@ from clamber.contact import (
     Region,
     Stance,
 )
-from clamber.errors import InputError, Status
+from clamber.errors import InputError, Status, unreadable
 from clamber.execution import Event
 from clamber.model import LIMBS, ROBOTS, Kinematics, Limb, Robot, RobotFile, World
 from clamber.pipeline import Iteration, Midway, Plan, PlanOptions, Skipped
@@ -66,6 +66,21 @@ EXECUTION = "execution.json"
 REPLANNED = "replan.json"
 PLANNED_SCENE = "planned.xml"  # where physics ran another world than was planned for
 PLANNED_TRAJECTORY = "planned.npz"  # where another one was followed in the end
+RUN_MAKERS = "`clamber climb` or `clamber plan` makes one"
+NO_TRAJECTORY = (
+    "a plan that got as far as a trajectory; the last line of `clamber plan` says why"
+    " this one did not"
+)
+_MAKERS = {
+    SEQUENCE: "contacts",
+    POLICY: "learn",
+    PLAN: "plan",
+    TRAJECTORY: "plan",
+    SCENE: "plan",
+    ROLLOUT: "simulate",
+    EXECUTION: "simulate",
+    VERDICT: "simulate",
+}
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
 _OF_AN_EARLIER_PLAN = (
     TRAJECTORY,
@@ -211,9 +226,9 @@ def _read_json(path: Path, kind: type[_Model]) -> _Model:
     try:
         content = json.loads(path.read_text())
     except OSError as e:
-        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+        raise unreadable(path, e, _maker(path)) from e
     except ValueError as e:
-        raise InputError(f"a whole JSON file ({e})", source=path) from e
+        raise InputError(f"a whole JSON file ({e}); {_maker(path)}", source=path) from e
     if not isinstance(content, dict):
         raise InputError(
             "an object of fields", source=path, value=type(content).__name__
@@ -229,6 +244,12 @@ def _read_json(path: Path, kind: type[_Model]) -> _Model:
         return kind.model_validate(content)
     except pydantic.ValidationError as e:
         raise input_error(e, path) from e
+
+
+def _maker(path: Path) -> str:
+    """What to do where a file is missing or broken: the command that writes it."""
+    command = _MAKERS.get(path.name)
+    return f"`clamber {command}` writes it" if command else "check the path"
 
 
 def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -247,7 +268,9 @@ class _Arrays:
                 self._arrays = {k: f[k] for k in f.files}
         except _UNREADABLE as e:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else e
-            raise InputError(f"a whole .npz file ({reason})", source=path) from e
+            raise InputError(
+                f"a whole .npz file ({reason}); {_maker(path)}", source=path
+            ) from e
 
     def __contains__(self, name: str) -> bool:
         return name in self._arrays
@@ -953,7 +976,7 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError("a run folder", source=folder)
+        raise InputError(f"a run folder; {RUN_MAKERS}", source=folder)
     path = folder / PLAN
     file = _read_json(path, _PlanFile)
     try:
@@ -1054,7 +1077,7 @@ def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
                 world.landmark(name)
         return world
     except OSError as e:
-        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+        raise unreadable(path, e, _maker(path)) from e
     except (ValueError, KeyError, IndexError) as e:
         reason = " ".join(str(e.args[0] if e.args else e).split())
         raise InputError(

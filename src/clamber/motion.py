@@ -23,6 +23,7 @@ from clamber.io import (
     EXECUTION,
     PLAN,
     ROLLOUT,
+    RUN_MAKERS,
     SCENE,
     TIMINGS,
     TRAJECTORY,
@@ -110,7 +111,7 @@ def read_run(folder: Path) -> Run:
         InputError: It is no folder.
     """
     if not folder.is_dir():
-        raise InputError("a run folder", source=folder)
+        raise InputError(f"a run folder; {RUN_MAKERS}", source=folder)
     reading = Reading(folder)
     written = reading.fields(PLAN)
     ran = reading.has(ROLLOUT)

@@ -268,7 +268,9 @@ def check_start(ik: IK, start: Keyframe) -> None:
     boxes = [b.name for b in world.scene.boxes if b.name in names]
     if depth > 0 and boxes:
         raise InputError(
-            "a start where no box is", field="scene.start", value=" and ".join(names)
+            "a start where no box is: move the one or the other",
+            field="scene.start",
+            value=" and ".join(names),
         )
     if start.com_margin < 0 or not start.equilibrium.feasible:
         limit = start.equilibrium.limiting

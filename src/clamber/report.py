@@ -32,7 +32,7 @@ import numpy as np
 from PIL import Image
 
 from clamber.errors import InputError
-from clamber.io import PLAN, VERDICT, whole_file
+from clamber.io import PLAN, RUN_MAKERS, VERDICT, whole_file
 from clamber.meshes import Mesh, body_meshes
 from clamber.model import Kinematics
 from clamber.motion import (
@@ -162,7 +162,7 @@ def run_record(folder: Path) -> dict[str, Any]:
     picture = reading.attempt(lambda: _picture(folder / PERSON))
     if not (written or run.verdict or run.execution or picture):
         raise InputError(
-            f"a run folder with {PLAN} or {VERDICT} ({'; '.join(run.missing)})",
+            f"a run folder with a whole {PLAN} or {VERDICT}; {RUN_MAKERS}",
             source=folder,
         )
     motion = None

@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import ArrayLike
 
 from clamber.boxes import NAME, read_drawn_boxes
-from clamber.errors import InputError
+from clamber.errors import InputError, unreadable
 from clamber.se3 import matrix_from_rpy
 
 GROUND = "ground"
@@ -367,7 +367,9 @@ def input_error(error: pydantic.ValidationError, source: object) -> InputError:
     if first["type"] == "missing":
         text, value = "a value: it is missing", None
     elif first["type"] == "extra_forbidden":
-        text = "no such field"
+        text = "no such field: mend its name, or leave it out"
+    if not where:  # the fields together are wrong: their values are no help
+        return InputError(text, source=source)
     return InputError(text, source=source, field=where, value=value)
 
 
@@ -380,14 +382,21 @@ def read_yaml(path: Path) -> dict:
     try:
         content = yaml.safe_load(path.read_text())
     except OSError as e:
-        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+        raise unreadable(path, e) from e
     except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise InputError(f"YAML ({str(e).splitlines()[0]})", source=path) from e
+        raise InputError(f"YAML ({_fault(e)})", source=path) from e
     if not isinstance(content, dict):
         raise InputError(
             "a mapping of fields", source=path, value=type(content).__name__
         )
     return content
+
+
+def _fault(error: yaml.YAMLError | UnicodeDecodeError) -> str:
+    """What is wrong with a YAML file, and in which line."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"line {error.problem_mark.line + 1}: {error.problem}"
+    return str(error).splitlines()[0]
 
 
 def load_scene(path: str | Path) -> Scene:

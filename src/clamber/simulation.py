@@ -51,8 +51,7 @@ class Rollout:
         surfaces: Names of the nS surfaces.
         overlap: Deepest overlap of any contact [m].
         end_share: Vertical force, share of the weight, by `surface@support` over the
-        last
-            second; other parts are called `other`.
+            last second; other parts are called `other`.
         unintended_share: Normal impulse on other parts over that on all.
         self_overlap: Deepest overlap of the robot with itself [m]; self_pair: where.
         unintended_parts: The same share by part.

@@ -25,7 +25,7 @@ from typing import IO, Any
 import yaml
 
 from clamber.demo import load_demo
-from clamber.errors import ClamberError, InputError, MissingDependency
+from clamber.errors import ClamberError, InputError, MissingDependency, unreadable
 from clamber.experiment import (
     Run,
     Spec,
@@ -450,7 +450,7 @@ def load_sweep(folder: Path) -> tuple[Spec, Rows]:
     try:
         text = path.read_text()
     except OSError as e:
-        raise InputError(f"a readable table ({e.strerror})", source=path) from e
+        raise unreadable(path, e, "`clamber sweep` writes it") from e
     whole = text[: text.rfind("\n") + 1]
     return spec, _Todo(spec, read_outcomes(spec, whole, path)).sorted()
 

@@ -31,7 +31,7 @@ from PIL import Image, ImageDraw, ImageFont
 from clamber.contact import Contact, ContactSequence
 from clamber.demo import Demonstration
 from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.io import ROLLOUT, load_plan, load_rollout, whole_file
+from clamber.io import NO_TRAJECTORY, ROLLOUT, load_plan, load_rollout, whole_file
 from clamber.model import Kinematics, Robot, World, build_world
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
@@ -1077,7 +1077,10 @@ def render_frame(
     else:
         plan = load_plan(folder)
         if plan.trajectory is None:
-            raise InputError("a plan that got as far as a trajectory", source=folder)
+            raise InputError(
+                NO_TRAJECTORY,
+                source=folder,
+            )
         world, t, q = plan.world, plan.trajectory.time, plan.trajectory.q
     if not t[0] <= time <= t[-1]:
         raise InputError(

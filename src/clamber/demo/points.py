@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clamber.errors import InputError
+from clamber.errors import InputError, unreadable
 
 MAX_RATE = 100_000.0  # [Hz] more is a mistake, not a camera
 MAX_POINTS = 10_000
@@ -64,9 +64,7 @@ def read_safely(read: Callable[[Path], Points], path: Path) -> Points:
     try:
         points = read(path)
     except OSError as e:
-        raise InputError(
-            f"a readable file ({e.strerror or 'unreadable'})", source=path
-        ) from e
+        raise unreadable(path, e) from e
     if len(points.position) < 2 or not points.names:
         raise InputError(
             "at least two samples of at least one point",

@@ -34,7 +34,7 @@ from clamber.demo.marker_sets import (
     solve_centres,
 )
 from clamber.demo.points import MAX_RATE, METRES, Points, read_safely
-from clamber.errors import InputError
+from clamber.errors import InputError, unreadable
 from clamber.scene import Box, Scene, input_error, load_scene, read_yaml
 from clamber.se3 import matrix_from_quat
 
@@ -169,7 +169,7 @@ def read_points(
         with path.open("rb") as file:
             start = file.read(64)
     except OSError as e:
-        raise InputError(f"a readable file ({e.strerror})", source=path) from e
+        raise unreadable(path, e) from e
     plain = start.lstrip(b'\xef\xbb\xbf" \t\r\n')
     by_content = [
         r for _, at, magic, r in _READERS
@@ -372,7 +372,7 @@ def _read_names(names: str | list[str], folder: Path, source: Path) -> list[str]
         try:
             names = json.loads(path.read_text())
         except OSError as e:
-            raise InputError(f"a readable file ({e.strerror})", source=path) from e
+            raise unreadable(path, e) from e
         except (ValueError, RecursionError) as e:
             raise InputError("a JSON list of names", source=path) from e
         source = path

@@ -1,0 +1,340 @@
+"""What a person or a program sees of a command: progress, tables, one JSON object.
+
+Progress goes to stderr, results to stdout. A table is made of the same record that
+`--json` prints, so that both say the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+import clamber
+
+REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
+"""The exit codes: the robot made it (or the command did its work), it did not, bad
+input, interrupted, nobody reads the output any more (as in `clamber ... | head`)."""
+
+Report = Callable[[str, float, str], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """How results are shown."""
+
+    json: bool = False
+    """Print the result as one JSON object."""
+    quiet: bool = False
+    """No progress, no table: files and exit code only."""
+
+    @contextlib.contextmanager
+    def progress(self) -> Iterator[Report]:
+        """Yield `report(stage, share done, note)`; it draws on stderr."""
+        console = Console(stderr=True)
+        if self.quiet:
+            yield lambda stage, done, note: None
+        elif console.is_terminal:
+            with progress_bars(console) as report:
+                yield report
+        else:
+            yield progress_lines(console)
+
+    def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
+        """Print one JSON object, or tables and a closing sentence, on stdout."""
+        if self.json:
+            sys.stdout.write(
+                json.dumps({"version": 1, **record}, allow_nan=False) + "\n"
+            )
+        elif not self.quiet:
+            seen = sys.stdout.isatty()
+            console = Console(
+                width=None if seen else 140, highlight=False, markup=False
+            )
+            for k, table in enumerate(tables):
+                if k:
+                    console.print()
+                console.print(table)
+            if note:
+                console.print(note, soft_wrap=not seen)  # a log has no width
+
+
+@contextlib.contextmanager
+def progress_bars(console: Console) -> Iterator[Report]:
+    """One bar for each stage, with its share and the time left."""
+    columns = (
+        TextColumn("{task.description:<10}"),
+        BarColumn(bar_width=24),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks = {}
+
+        def report(stage: str, done: float, note: str) -> None:
+            if stage not in tasks:
+                for earlier in tasks.values():
+                    bars.update(earlier, completed=1.0, note="")
+                tasks[stage] = bars.add_task(stage, total=1.0, note=note)
+            bars.update(tasks[stage], completed=done, note=note)
+
+        yield report
+        for task in tasks.values():
+            bars.update(task, completed=1.0, note="")
+
+
+def progress_lines(console: Console) -> Report:
+    """One line for each tenth of a stage, for logs."""
+    shown: dict[str, int] = {}
+
+    def report(stage: str, done: float, note: str) -> None:
+        tenth = int(10 * done)
+        if shown.get(stage, -1) < tenth:
+            shown[stage] = tenth
+            line = f"{stage} {100 * done:3.0f} % {note}".rstrip()
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    return report
+
+
+class Clock:
+    """Seconds by stage and by move, from what the stages report of themselves."""
+
+    def __init__(self) -> None:
+        """Nothing has run yet."""
+        self._stages: dict[str, float] = {}
+        self._moves: list[tuple[str, float]] = []
+
+    def watching(self, report: Report) -> Report:
+        """A report that also takes the time."""
+        began: dict[tuple[str, float, str], float] = {}
+        last: tuple[str, float, str] | None = None
+
+        def timed(stage: str, done: float, note: str) -> None:
+            nonlocal last
+            now = time.perf_counter()
+            if last is not None:
+                spent = now - began[last]
+                self._stages[last[0]] = self._stages.get(last[0], 0.0) + spent
+                if last[0] == "plan":
+                    self._add(last, spent)
+            last = (stage, done, note)
+            began[last] = now
+            report(stage, done, note)
+
+        return timed
+
+    def _add(self, step: tuple[str, float, str], spent: float) -> None:
+        """A move that is tried again, for a later one's sake, costs both times."""
+        for i, (note, seconds) in enumerate(self._moves):
+            if note == step[2]:
+                self._moves[i] = (note, seconds + spent)
+                return
+        self._moves.append((step[2], spent))
+
+    def stages(self) -> dict[str, float]:
+        """Seconds by stage."""
+        return dict(self._stages)
+
+    def of(self, move: object) -> float | None:
+        """Seconds that a move took; None where it was not watched."""
+        return dict(self._moves).get(str(move))
+
+
+def new_table(*columns: str, numbers: bool = False) -> Table:
+    """An empty table without rules, its last column the one that is folded.
+
+    `numbers`: all columns but the first are narrow ones of numbers.
+    """
+    gap = 1 if numbers else 2
+    table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, gap, 0, 0))
+    for k, name in enumerate(columns):
+        table.add_column(name, justify="right" if numbers and k else "left")
+    table.columns[-1].overflow = "fold"
+    return table
+
+
+def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any]:
+    """What `--json` says of a plan; costs and margins are those of `plan.json`."""
+    moves = [None, *(p.transition.move for p in plan.paths)]
+    keyframes = []
+    for i, key in enumerate(plan.keyframes):
+        move = moves[i] if i < len(moves) else None
+        keyframes.append(
+            {
+                "move": "start" if i == 0 else str(move),
+                "method": key.method,
+                "iterations": key.iterations,
+                "seconds": None if clock is None or i == 0 else clock.of(move),
+                "cost_before": key.cost_before,
+                "cost_after": key.cost_after,
+                "projected_distance": {
+                    c.contact.surface: c.projected_distance for c in key.contacts
+                },
+                "com_margin": key.com_margin if math.isfinite(key.com_margin) else None,
+                "equilibrium_margin": key.equilibrium.margin,
+                "limiting": key.equilibrium.limiting,
+            }
+        )
+    return {
+        "complete": plan.complete,
+        "instead": plan.instead,
+        "keyframes": keyframes,
+        "skipped": [{"stance": s.stance, "reason": s.reason} for s in plan.skipped],
+    }
+
+
+def keyframe_tables(record: Mapping[str, Any]) -> list[Table]:
+    """The keyframes of a record: how each was found, and where its contacts are."""
+    found = new_table(
+        "move", "iter", "time [s]", "cost", "after", "CoM [mm]", "push", "limit"
+    )
+    keys = record["keyframes"]
+    for k in keys:
+        com = k["com_margin"]
+        found.add_row(
+            k["move"],
+            str(k["iterations"]),
+            "-" if k["seconds"] is None else f"{k['seconds']:.2f}",
+            f"{k['cost_before']:.3f}",
+            f"{k['cost_after']:.3f}",
+            "-" if com is None else f"{1000 * com:.0f}",
+            f"{k['equilibrium_margin']:.2f}",
+            k["limiting"] or "-",
+        )
+    surfaces = list(dict.fromkeys(s for k in keys for s in k["projected_distance"]))
+    distances = new_table("projected distance [mm]", *surfaces, numbers=True)
+    for k in keys:
+        d = k["projected_distance"]
+        cells = (f"{1000 * d[s]:.0f}" if s in d else "" for s in surfaces)
+        distances.add_row(k["move"], *cells)
+    return [found, distances]
+
+
+def replanned_record(found: clamber.Replanned) -> dict[str, Any]:
+    """Differences and plans, the best first."""
+    return {
+        "differences": [list(d) for d in found.differences],
+        "plans": [
+            {"surfaces": list(r.surfaces), "cost": r.cost, "stable": r.stable}
+            for r in found.ranked
+        ],
+    }
+
+
+def outcome(plan: clamber.Plan) -> str:
+    """One clause: planned to the end, or why not."""
+    if plan.complete:
+        return "; ".join(filter(None, (plan.instead, "planned to the last stance")))
+    if plan.instead:
+        return f"the robot cannot do it: {plan.instead}"
+    missed = [s.reason for s in plan.skipped if s.missed]
+    why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
+    return f"the robot cannot do it: {why}"
+
+
+def closing(note: str, folder: Path, well: bool) -> str:
+    """The last line: how it ended, where the files are, and what to look at."""
+    look = "" if well else f"; `clamber report {folder}` shows how far it came"
+    return f"{note}; the files are in {folder}{look}"
+
+
+def skipped_tables(plan: clamber.Plan) -> list[Table]:
+    """A table of the stances left out, where there are any."""
+    if not plan.skipped:
+        return []
+    table = new_table("skipped stance", "because")
+    for s in plan.skipped:
+        table.add_row(str(s.stance), s.reason)
+    return [table]
+
+
+def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
+    """Options, and how the pelvis is held."""
+    options = new_table(
+        " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
+        "until",
+    )  # fmt: skip
+    for o in policy.options:
+        options.add_row(
+            o.name, o.region, ", ".join(o.surfaces), str(o.repeats),
+            " ".join(o.initiation), o.termination,
+        )  # fmt: skip
+    pelvis = new_table("pelvis", "angle", "mean [deg]", "sigma [deg]", "imposed [deg]")
+    for place, d in (("near edge", policy.near_edge), ("over top", policy.over_top)):
+        for k, angle in enumerate(("roll", "pitch", "yaw")):
+            imposed = d.imposed[k]
+            pelvis.add_row(
+                "" if k else f"{place} ({d.samples})",
+                angle,
+                f"{math.degrees(d.mean[k]):.1f}",
+                f"{math.degrees(d.sigma[k]):.1f}",
+                "-"
+                if imposed is None
+                else " to ".join(f"{math.degrees(x):.1f}" for x in imposed),
+            )
+    return [options, pelvis]
+
+
+def conclude(
+    output: Output,
+    folder: Path,
+    plan: clamber.Plan,
+    done: tuple[clamber.Rollout, clamber.Verdict] | None,
+    clock: Clock | None = None,
+) -> int:
+    """Show the verdict and where the files are; the exit code says the same."""
+    table = new_table("criterion", "value", "limit", "")
+    rollout, verdict = (None, None) if done is None else done
+    criteria = {} if verdict is None else verdict.criteria
+    for name, c in criteria.items():
+        table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
+    reached = verdict is not None and verdict.reached
+    planned = plan_record(plan, clock)
+    record = {
+        "out": str(folder),
+        "reached": reached,
+        "criteria": {
+            n: {"value": c.value, "limit": c.limit, "ok": c.ok}
+            for n, c in criteria.items()
+        },
+        "events": [] if rollout is None else [asdict(e) for e in rollout.events],
+        "stopped": "" if rollout is None else rollout.stopped,
+        **planned,
+    }
+    if reached:
+        note = "; ".join(filter(None, (plan.instead, "the robot made it")))
+    elif not plan.complete:
+        note = outcome(plan)
+    elif rollout is not None and rollout.stopped:
+        note = f"the robot stopped on the way: {rollout.stopped}"
+    else:
+        wrong = [n for n, c in criteria.items() if not c.ok]
+        note = f"the robot did not make it ({', '.join(wrong) or 'nothing planned'})"
+    tables = keyframe_tables(planned) if clock is not None else []
+    tables += skipped_tables(plan)
+    if rollout is not None and rollout.events:
+        felt = new_table("at [s]", "felt on the way")
+        for e in rollout.events:
+            felt.add_row(f"{e.time:.2f}", e.text)
+        tables.append(felt)
+    tables += [table] if criteria else []
+    output.show(record, *tables, note=closing(note, folder, reached))
+    return REACHED if reached else MISSED
