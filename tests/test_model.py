@@ -111,6 +111,37 @@ def test_home_stands_at_the_start_with_its_soles_on_the_ground(start):
     )
 
 
+@pytest.mark.parametrize("ahead", [0.0, 0.08])
+def test_knees_that_would_be_in_a_box_at_the_start_are_straighter(ahead):
+    size = np.array([0.6, 0.8, 0.25])
+    box = Box(
+        name="table",
+        size=size,
+        position=np.array([0.53, 0.0, 0.125]),
+        rotation=np.eye(3),
+    )
+    start = np.array([ahead, 0.0, 0.0])
+    robot = load_robot("coman")
+    w = build_world(robot, Scene(boxes=(box,), start=start))
+    knee = w.home[w.model.joint("LKneeSag").qposadr[0]]
+    near = ahead > 0
+    assert (knee < robot.home["LKneeSag"] - 0.1) == near
+    data = fresh(w, w.home)
+    fromto = np.zeros(6)
+    table = w.model.geom("table").id
+    gap = min(
+        mujoco.mj_geomDistance(w.model, data, int(a), int(b), 1.0, fromto)
+        for a, b in w.pairs
+        if table in (a, b)
+    )
+    assert gap > 0
+    kin = Kinematics(w)
+    kin.update(w.home)
+    up = np.array([0.0, 0.0, 1.0])
+    for foot in ("LFoot", "RFoot"):
+        assert kin.contact_point(foot, up)[2] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_home_is_the_same_posture_wherever_it_starts(world):
     other = build_world(load_robot("coman"), scene_of(start=(0.5, 0.5, 1.2)))
     np.testing.assert_array_equal(other.home[7:], world.home[7:])

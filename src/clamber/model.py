@@ -31,6 +31,8 @@ LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
 PHYSICS_STEP = 0.001  # [s]
 SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
 IMPRATIO = 10.0  # friction stiffer than normal force: no creep while standing
+BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
+CLEAR = 0.002  # [m] that they keep from boxes at the start
 DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
 DEFAULT_DAMPING = 3.0  # [N m s/rad] where the description has none
 
@@ -532,7 +534,8 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
     data.qpos[:] = home
     mujoco.mj_kinematics(model, data)
     surfaces = {s: _surface(model, data, s) for s in robot.surfaces}
-    home = _stand(model, data, robot, scene, home, surfaces)
+    pairs = _pairs(model, data, base)
+    home = _stand_clear(model, data, robot, scene, home, surfaces, pairs)
     return World(
         model=model,
         xml=xml,
@@ -555,7 +558,7 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         kp=gains[:, 0],
         kd=gains[:, 1],
         ki=gains[:, 2],
-        pairs=_pairs(model, data, base),
+        pairs=pairs,
         support_geom={s.name: model.geom(s.name).id for s in scene.supports},
         support_of_geom={
             g: s.name
@@ -667,6 +670,57 @@ def _stand(
     turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
     mujoco.mju_mulQuat(out[3:7], turn, home[3:7])
     return out
+
+
+def _stand_clear(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    robot: Robot,
+    scene: Scene,
+    home: np.ndarray,
+    surfaces: Mapping[str, Surface],
+    pairs: np.ndarray,
+) -> np.ndarray:
+    """Stand at the start, the legs straighter where bent knees would be in a box.
+
+    Where they are in it even so, the posture is that of `home`.
+    """
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    boxes = pairs[(fixed & ~plane)[pairs].any(axis=1)]
+    legs, fromto = _leg_joints(model, robot, surfaces), np.zeros(6)
+    for bend in (*BENDS, 1.0):
+        posture = home.copy()
+        posture[model.jnt_qposadr[legs]] *= bend
+        data.qpos[:] = posture
+        mujoco.mj_kinematics(model, data)
+        posture = _stand(model, data, robot, scene, posture, surfaces)
+        data.qpos[:] = posture
+        mujoco.mj_kinematics(model, data)
+        if all(
+            mujoco.mj_geomDistance(model, data, int(a), int(b), CLEAR, fromto) >= CLEAR
+            for a, b in boxes
+        ):
+            break
+    return posture
+
+
+def _leg_joints(
+    model: mujoco.MjModel, robot: Robot, surfaces: Mapping[str, Surface]
+) -> list[int]:
+    """Hinges between the base and the soles."""
+    links = set()
+    for limb in robot.limbs.values():
+        body = 0 if limb.is_arm else surfaces[limb.surfaces[0]].body
+        while body and model.body(body).name != robot.base:
+            links.add(body)
+            body = int(model.body_parentid[body])
+    return [
+        j
+        for j in range(model.njnt)
+        if int(model.jnt_bodyid[j]) in links
+        and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
 
 
 def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:

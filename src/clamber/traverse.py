@@ -53,6 +53,7 @@ TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
 CYCLES = (1.0, 0.5, 0.25)  # a cycle over a riser that fails is tried shorter
 SHRUNK = (1.0, 0.6, 0.3)  # a step that fails is tried shorter
+NEARER = (0.0, 0.4)  # share of the way to a limb that is stuck, to stand around it
 SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
 NEARLY = 0.12  # [m] ... where it gets no nearer, it may climb down from here
@@ -632,30 +633,58 @@ def _crawl(
         made = _over_riser(task, key, platform, option, bodies, leading)
         if made:
             return made, ""
-    for body in tries:
-        made, left, why = _twice(task, key, platform, option, body, leading)
-        if left and made:
-            # The others have gone too far ahead: around the first that is left behind
-            # they stand again as they should, and it may follow.
-            stuck, now = left[0], made[-1][0]
-            limb = task.ik.world.robot.limb_of(stuck).name
-            here = _by_limb(task, now.stance)[limb].position[:2]
-            back = here - _turn(body.yaw) @ task.build.fours[limb]
-            others = [s for s in option.surfaces if s != stuck]
-            around = _Frame(back, body.yaw)
-            # Over a riser it may follow before all are back.
-            groups = [[s] for s in others] if _rises(task, platform) else [others]
-            for group in groups:
-                _cycle(task, now, platform, option, around, group, made, back=True)
-                now = made[-1][0]
-                left, why = _cycle(task, now, platform, option, body, [stuck], made)
-                if not left:
-                    break
-            if left:
-                continue
+    stuck = []
+    k = len(leading) // 2
+    for body, order in (
+        (full, leading),
+        (full, leading[k:] + leading[:k]),
+        *((x, leading) for x in tries[1:]),
+    ):
+        made, left, why = _twice(task, key, platform, option, body, order)
+        if made and not left:
+            return made, ""
+        if made:
+            stuck.append((body, made, left[0]))
+    # The others have gone too far ahead: around the first that is left behind they
+    # stand again as they should, and it may follow.
+    for body, made, surface in stuck:
+        made, why = _brought_back(task, platform, option, body, surface, made)
         if made:
             return made, ""
     return [], why or "no contact of the cycle moves"
+
+
+def _brought_back(
+    task: _Task,
+    platform: Platform,
+    option: Option,
+    body: _Frame,
+    stuck: str,
+    made: Sequence[_Made],
+) -> tuple[list[_Made], str]:
+    """After `made`, the others around the surface that is stuck, which then follows.
+
+    First where they stand around it on all fours; then nearer to it, so that they bear
+    more of the weight and it is stretched less. Nothing, and why, where it is stuck
+    even so.
+    """
+    key, why = made[-1][0], ""
+    limb = task.ik.world.robot.limb_of(stuck).name
+    here = _by_limb(task, key.stance)[limb].position[:2]
+    others = [s for s in option.surfaces if s != stuck]
+    # Over a riser it may follow before all are back.
+    groups = [[s] for s in others] if _rises(task, platform) else [others]
+    for nearer in NEARER:
+        out, now = list(made), key
+        offset = (1.0 - nearer) * task.build.fours[limb]
+        around = _Frame(here - _turn(body.yaw) @ offset, body.yaw)
+        for group in groups:
+            _cycle(task, now, platform, option, around, group, out, back=True)
+            now = out[-1][0]
+            left, why = _cycle(task, now, platform, option, body, [stuck], out)
+            if not left:
+                return out, ""
+    return [], why
 
 
 def _over_riser(
