@@ -175,6 +175,7 @@ def test_who_does_not_make_it_is_told_where_to_look(
 
 # What people do wrong: what is said of it, and what to do instead.
 MISTAKES = {
+    "view nothing": ("'nothing'", "a file that ends in"),
     "": ("Expected one of {climb, contacts", "clamber --help says more"),
     "nonsense": ("nonsense", "clamber --help says more"),
     "plan": ("Missing from clamber plan: SEQUENCE", "clamber plan --help says more"),

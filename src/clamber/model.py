@@ -689,6 +689,7 @@ def _stand_clear(
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     boxes = pairs[(fixed & ~plane)[pairs].any(axis=1)]
     legs, fromto = _leg_joints(model, robot, surfaces), np.zeros(6)
+    posture = home
     for bend in (*BENDS, 1.0):
         posture = home.copy()
         posture[model.jnt_qposadr[legs]] *= bend
