@@ -268,7 +268,7 @@ def test_where_nothing_is_found_it_says_what_was_tried(failing, demo_sequence, c
 def test_contacts_without_alternatives_are_planned_once(failing, demo_sequence, coman):
     """The only combination is the demonstrated one, which has just failed."""
     asked = failing("LFoot")
-    bare = alternatives._without(demo_sequence, {"LElbow", "RElbow"})
+    bare = alternatives.without_surfaces(demo_sequence, {"LElbow", "RElbow"})
     scene = Scene.from_height(0.275)
     found = plan_or_replan(bare, coman, scene, bounds=Bounds(tries=0))
     assert found.instead.endswith("there is no alternative")

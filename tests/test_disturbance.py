@@ -64,7 +64,7 @@ def test_beyond_a_bound_the_error_names_field_value_and_range(name, side):
     ("name", "value"), [("mass", None), ("mass", "heavy"), ("seed", 1.5), ("yaw", [0])]
 )
 def test_what_is_no_such_number_is_refused(name, value):
-    with pytest.raises(InputError, match=rf"disturb\.{name} .*number from"):
+    with pytest.raises(InputError, match=rf"disturb\.{name}\b.*number from"):
         Disturbance(**{name: value})
 
 

@@ -305,7 +305,7 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
     demo_sequence, coman
 ):
     """Figure 4.16: the knees on their way up a high box."""
-    result = plan(demo_sequence, coman, Scene.from_height(0.46))
+    result = plan(demo_sequence, coman, Scene.from_height(0.52))
     knees = [p for p in result.paths if "leg" in p.transition.move.limb]
     assert len(knees) == 2
     ik = IK(result.world)
@@ -321,4 +321,4 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
             knee = ik.kin.contact_point(made.surface, np.array([0.0, 0.0, 1.0]))
             if np.linalg.norm(knee - made.position) > 0.02:  # not yet touching down
                 assert distance > CLEARANCE - 1e-3
-    assert min(entered) < -5e-3  # the right knee: 17 mm into the box
+    assert min(entered) < -5e-3  # the right knee: 21 mm into the box
