@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -197,3 +199,36 @@ def one_hand_rollout(one_hand_plan):
     from clamber.simulation import simulate
 
     return simulate(one_hand_plan, controller="pid")
+
+
+@pytest.fixture(scope="module")
+def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
+    """The run folder of that motion; of the module alone, which may write in it."""
+    from clamber import io, judge
+
+    folder = tmp_path_factory.mktemp("whole")
+    io.save_plan(one_hand_plan, folder)
+    io.save_rollout(one_hand_plan, one_hand_rollout, folder)
+    io.save_verdict(judge(one_hand_plan, one_hand_rollout), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium with a software renderer."""
+    chromium = shutil.which("chromium")
+    playwright = pytest.importorskip("playwright.sync_api")
+    if chromium is None:
+        pytest.skip("no chromium here")
+    with playwright.sync_playwright() as p:
+        made = p.chromium.launch(
+            executable_path=chromium,
+            args=[
+                "--no-sandbox",
+                "--use-gl=angle",
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+            ],
+        )
+        yield made
+        made.close()

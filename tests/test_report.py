@@ -7,7 +7,6 @@ import base64
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,17 +39,6 @@ def rollout(one_hand_rollout: Rollout) -> Rollout:
 def planned(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("planned")
     io.save_plan(plan, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def whole(
-    plan: Plan, rollout: Rollout, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    folder = tmp_path_factory.mktemp("whole")
-    io.save_plan(plan, folder)
-    io.save_rollout(plan, rollout, folder)
-    io.save_verdict(clamber.judge(plan, rollout), folder)
     return folder
 
 
@@ -423,27 +411,6 @@ def test_the_command_names_the_file_and_on_stderr_what_is_missing(
 
 
 # In a browser.
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Headless Chromium with a software renderer."""
-    chromium = shutil.which("chromium")
-    playwright = pytest.importorskip("playwright.sync_api")
-    if chromium is None:
-        pytest.skip("no chromium here")
-    with playwright.sync_playwright() as p:
-        made = p.chromium.launch(
-            executable_path=chromium,
-            args=[
-                "--no-sandbox",
-                "--use-gl=angle",
-                "--use-angle=swiftshader",
-                "--enable-unsafe-swiftshader",
-            ],
-        )
-        yield made
-        made.close()
 
 
 def opened(browser: Any, file: Path, **options: Any) -> tuple[Any, list[str]]:

@@ -7,7 +7,6 @@ import json
 import shutil
 import socket
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 
 import clamber
-from clamber import cli, io
+from clamber import cli
 from clamber.errors import MissingDependency
 from clamber.model import Kinematics
 from clamber.pipeline import Plan
@@ -47,19 +46,6 @@ def ran(one_hand_plan: Plan, one_hand_rollout: Rollout) -> Shown:
 @pytest.fixture(scope="module")
 def planned(one_hand_plan: Plan) -> Shown:
     return show_run(one_hand_plan, None)
-
-
-@pytest.fixture(scope="module")
-def whole(
-    one_hand_plan: Plan,
-    one_hand_rollout: Rollout,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Path:
-    folder = tmp_path_factory.mktemp("whole")
-    io.save_plan(one_hand_plan, folder)
-    io.save_rollout(one_hand_plan, one_hand_rollout, folder)
-    io.save_verdict(clamber.judge(one_hand_plan, one_hand_rollout), folder)
-    return folder
 
 
 # What is shown at a time.
@@ -354,21 +340,6 @@ def test_a_port_in_use_takes_the_next_one(whole: Path):
 # In a browser.
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    chromium = shutil.which("chromium")
-    playwright = pytest.importorskip("playwright.sync_api")
-    pytest.importorskip("viser")
-    if chromium is None:
-        pytest.skip("no chromium here")
-    with playwright.sync_playwright() as p:
-        flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
-        flags.append("--enable-unsafe-swiftshader")
-        made = p.chromium.launch(executable_path=chromium, args=flags)
-        yield made
-        made.close()
-
-
 def opened(browser: Any, url: str, **options: Any) -> tuple[Any, list[str]]:
     """The page in a small window, and its complaints; no other address answers."""
     options = {"viewport": {"width": 760, "height": 480}, **options}
@@ -397,6 +368,7 @@ def test_a_run_is_played_jumped_in_edited_and_saved(
     browser: Any, whole: Path, tmp_path: Path
 ):
     """All by clicks but the drag: that goes through the gizmo's callback."""
+    pytest.importorskip("viser")
     run = Path(shutil.copytree(whole, tmp_path / "run"))
     before = {p.name for p in run.iterdir()}
     page = open_view(run, port=18090)
@@ -436,6 +408,7 @@ def test_a_run_is_played_jumped_in_edited_and_saved(
 
 
 def test_a_recording_is_shown_dark_and_on_a_phone(browser: Any):
+    pytest.importorskip("viser")
     page = open_view("climb", port=18095)
     try:
         size = {"width": 390, "height": 780}

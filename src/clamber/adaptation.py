@@ -15,7 +15,7 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import InputError, Status
-from clamber.model import Kinematics, World, build_world
+from clamber.model import Kinematics, World, build_world, chain_up
 from clamber.moves import Step, split_moves
 from clamber.path import ARC_WEIGHT, Path, Phase, bridge
 from clamber.pipeline import Midway, Plan, PlanOptions, search_steps, timed
@@ -315,9 +315,6 @@ def _limb_over(world: World, contact: Contact) -> np.ndarray:
     root = world.landmark(limb.root)[0]
     links = set()
     for surface in limb.surfaces:
-        body = world.surfaces[surface].body
-        while body not in (0, root):
-            links.add(body)
-            body = int(m.body_parentid[body])
+        links.update(chain_up(m, world.surfaces[surface].body, root))
     mine = np.isin(m.geom_bodyid[world.pairs], list(links)).any(axis=1)
     return mine & (world.pairs == world.support_geom[contact.support]).any(axis=1)

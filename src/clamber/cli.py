@@ -904,9 +904,7 @@ class RobotCommand:
             out = out or Path("robots") / proposal.name
             if out.exists() and (not out.is_dir() or any(out.iterdir())):
                 raise InputError(
-                    "a new or empty folder",
-                    source="--out",
-                    value=str(out),
+                    "a new or empty folder", source="--out", value=str(out)
                 )
             out = clamber.new_run_folder(out, "robot")
             clamber.save_proposal(proposal, out)

@@ -30,7 +30,7 @@ from clamber.adaptation import (
 )
 from clamber.contact import Contact
 from clamber.control import JointLaw
-from clamber.model import PHYSICS_STEP, Kinematics, World
+from clamber.model import PHYSICS_STEP, Kinematics, World, chain_up
 from clamber.moves import split_moves
 from clamber.pipeline import Midway, Plan
 from clamber.posture.keyframe import Keyframe
@@ -617,11 +617,7 @@ def _ankles(world: World) -> dict[str, np.ndarray]:
     out = {}
     for limb in world.robot.limbs.values():
         foot = limb.surfaces[0]
-        chain = set()
-        body = world.surfaces[foot].body
-        while body:
-            chain.add(body)
-            body = int(m.body_parentid[body])
+        chain = chain_up(m, world.surfaces[foot].body)
         joints = np.array([o and b in chain for o, b in zip(own, bodies, strict=True)])
         if joints.any() and not limb.is_arm:
             out[foot] = joints

@@ -22,12 +22,12 @@ import mujoco
 import numpy as np
 
 from clamber.errors import InputError, MissingDependency
-from clamber.io import NO_TRAJECTORY, ROLLOUT, load_plan, load_rollout, whole_file
+from clamber.io import ROLLOUT, load_plan, load_rollout, trajectory_of, whole_file
 from clamber.model import Kinematics, World
 from clamber.pipeline import Plan
 from clamber.scene import read_yaml
 from clamber.simulation import Rollout
-from clamber.trajectory import RATE, holding_torque
+from clamber.trajectory import RATE, Trajectory, holding_torque
 
 Format = Literal["csv", "mcap", "npz"]
 Layout = Literal["mjlab", "holosoma"]
@@ -186,26 +186,23 @@ def load_motion(
             f"a divisor of {RATE:.0f} Hz, as 50 or 100", source="--rate", value=rate
         )
     plan = load_plan(folder)
-    if plan.trajectory is None:
-        raise InputError(
-            NO_TRAJECTORY,
-            source=folder,
-        )
+    reference = trajectory_of(plan, folder)
     rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
-    motion = _sampled(plan, rollout, rate)
+    motion = _sampled(plan, reference, rollout, rate)
     if lead_in is None:
         return motion
     measured = measured_posture(plan.world, lead_in)
     return _with_lead_in(motion, plan, measured, lead_in_speed)
 
 
-def _sampled(plan: Plan, rollout: Rollout | None, rate: int) -> Motion:
+def _sampled(
+    plan: Plan, reference: Trajectory, rollout: Rollout | None, rate: int
+) -> Motion:
     """The reference on the grid of `rate`; states and forces held since the last one.
 
     Sample k of the reference is the command of physics step k.
     """
-    t = plan.trajectory
-    assert t is not None
+    t = reference
     world = plan.world
     n = len(t.time)
     if rollout is not None:

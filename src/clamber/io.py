@@ -67,10 +67,6 @@ REPLANNED = "replan.json"
 PLANNED_SCENE = "planned.xml"  # where physics ran another world than was planned for
 PLANNED_TRAJECTORY = "planned.npz"  # where another one was followed in the end
 RUN_MAKERS = "`clamber climb` or `clamber plan` makes one"
-NO_TRAJECTORY = (
-    "a plan that got as far as a trajectory; the last line of `clamber plan` says why"
-    " this one did not"
-)
 _MAKERS = {
     SEQUENCE: "contacts",
     POLICY: "learn",
@@ -1066,6 +1062,21 @@ def _robot(file: RobotFile) -> Robot:
         impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
         self_positioning=tuple(file.self_positioning),
     )
+
+
+def trajectory_of(plan: Plan, source: Path) -> Trajectory:
+    """The trajectory of a plan that is to be played.
+
+    Raises:
+        InputError: It got no motion; `source` is the folder that it came from.
+    """
+    if plan.trajectory is None:
+        raise InputError(
+            "a plan that got as far as a trajectory; the last line of `clamber plan`"
+            " says why this one did not",
+            source=source,
+        )
+    return plan.trajectory
 
 
 def _load_world(path: Path, robot: Robot, scene: Scene) -> World:

@@ -10,6 +10,7 @@ Shapes: N vertices, F triangles.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -39,6 +40,12 @@ class Mesh:
     normals: np.ndarray
     colours: np.ndarray
     triangles: np.ndarray
+
+
+def body_poses(data: mujoco.MjData, meshes: Sequence[Mesh]) -> np.ndarray:
+    """(nb, 7) position [m] and unit quaternion of the bodies of meshes."""
+    bodies = [m.body for m in meshes]
+    return np.concatenate([data.xpos[bodies], data.xquat[bodies]], axis=1)
 
 
 _Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices, normals, triangles

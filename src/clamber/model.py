@@ -689,33 +689,41 @@ def _stand_clear(
     plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     boxes = pairs[(fixed & ~plane)[pairs].any(axis=1)]
     legs, fromto = _leg_joints(model, robot, surfaces), np.zeros(6)
-    posture = home
-    for bend in (*BENDS, 1.0):
-        posture = home.copy()
-        posture[model.jnt_qposadr[legs]] *= bend
-        data.qpos[:] = posture
+    tried = []
+    for bend in BENDS:
+        bent = home.copy()
+        bent[model.jnt_qposadr[legs]] *= bend
+        data.qpos[:] = bent
         mujoco.mj_kinematics(model, data)
-        posture = _stand(model, data, robot, scene, posture, surfaces)
+        posture = _stand(model, data, robot, scene, bent, surfaces)
         data.qpos[:] = posture
         mujoco.mj_kinematics(model, data)
         if all(
             mujoco.mj_geomDistance(model, data, int(a), int(b), CLEAR, fromto) >= CLEAR
             for a, b in boxes
         ):
-            break
-    return posture
+            return posture
+        tried.append(posture)
+    return tried[0]
+
+
+def chain_up(model: mujoco.MjModel, body: int, top: int = 0) -> list[int]:
+    """A body and those it hangs on, up to `top` or the world, which are left out."""
+    chain = []
+    while body not in (0, top):
+        chain.append(body)
+        body = int(model.body_parentid[body])
+    return chain
 
 
 def _leg_joints(
     model: mujoco.MjModel, robot: Robot, surfaces: Mapping[str, Surface]
 ) -> list[int]:
     """Hinges between the base and the soles."""
-    links = set()
+    base, links = model.body(robot.base).id, set()
     for limb in robot.limbs.values():
-        body = 0 if limb.is_arm else surfaces[limb.surfaces[0]].body
-        while body and model.body(body).name != robot.base:
-            links.add(body)
-            body = int(model.body_parentid[body])
+        if not limb.is_arm:
+            links.update(chain_up(model, surfaces[limb.surfaces[0]].body, base))
     return [
         j
         for j in range(model.njnt)

@@ -323,10 +323,13 @@ def sample_motion(
     if rollout is not None:
         reference = rollout.followed or reference
     series: dict[str, Any]
+    loads = None
     if rollout is not None:
         rows = even_rows(rollout.time, most)
         time, q = rollout.time[rows], rollout.qpos[rows]
-        series = _physics(rollout, reference, rows)
+        loaded = steadily_loaded(rollout)
+        loads = spells(rollout.time, loaded)
+        series = _physics(rollout, reference, loaded, rows)
     elif reference is not None:
         rows = even_rows(reference.time, most)
         time, q = reference.time[rows], reference.q[rows]
@@ -351,9 +354,6 @@ def sample_motion(
         series["error"] = _errors(world, q, q_ref)
     end = float(time[-1])
     schedule = [] if reference is None else spells(reference.time, reference.contact)
-    loads = None
-    if rollout is not None:
-        loads = spells(rollout.time, steadily_loaded(rollout))
     schedule = [[(a, min(b, end)) for a, b in x if a < end] for x in schedule]
     switches = {t for x in loads or schedule for pair in x for t in pair}
     return Motion(
@@ -389,7 +389,10 @@ def even_rows(time: np.ndarray, most: int | None) -> np.ndarray:
 
 
 def _physics(
-    rollout: Rollout, reference: Trajectory | None, rows: np.ndarray
+    rollout: Rollout,
+    reference: Trajectory | None,
+    loaded: np.ndarray,
+    rows: np.ndarray,
 ) -> dict[str, np.ndarray | None]:
     """Series of what physics made; torques and forces at their peaks."""
     world = rollout.world
@@ -397,7 +400,7 @@ def _physics(
     effort = rollout.actuator_force[:, order] / world.tau_max
     size = np.linalg.norm(rollout.contact_force, axis=2)
     out: dict[str, np.ndarray | None] = {
-        "loaded": steadily_loaded(rollout)[rows],
+        "loaded": loaded[rows],
         "force": rollout.contact_force[rows],
         "size": peaks(size, rows),
         "effort": peaks(effort, rows),

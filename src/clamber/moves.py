@@ -120,7 +120,7 @@ def split_moves(
                 makes, breaks = None, (down,)
             else:
                 makes = max(wanted, key=lambda c: limb.surfaces.index(c.surface))
-                if has is not None and _same_place(has, makes):
+                if has is not None and same_place(has, makes):
                     continue
                 if has is None and makes.surface == down:
                     closed[limb.name] = makes
@@ -137,7 +137,8 @@ def split_moves(
     return steps, skipped
 
 
-def _same_place(a: Contact, b: Contact) -> bool:
+def same_place(a: Contact, b: Contact) -> bool:
+    """Whether a surface is where it was, within `SAME_PLACE`."""
     near = float(np.linalg.norm(a.position - b.position)) < SAME_PLACE
     return a.surface == b.surface and a.support == b.support and near
 

@@ -974,7 +974,7 @@ def _mjcf(
             links[b] = links[model.body_parentid[b]]
     elements: dict[int, ElementTree.Element] = {0: world}
     for b in range(1, model.nbody):
-        if links[b] != b or not _below(model, b, found.base):
+        if links[b] != b or not hangs_on(model, b, found.base):
             continue
         parent = int(links[model.body_parentid[b]])
         R_WP = data.xmat[parent].reshape(3, 3)
@@ -1005,12 +1005,6 @@ def _mjcf(
             ElementTree.SubElement(contact, "exclude", body1=a, body2=b)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _below(model: mujoco.MjModel, body: int, base: int) -> bool:
-    while body and body != base:
-        body = int(model.body_parentid[body])
-    return body == base
 
 
 def _add_inertia(

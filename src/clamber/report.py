@@ -33,7 +33,7 @@ from PIL import Image
 
 from clamber.errors import InputError
 from clamber.io import PLAN, RUN_MAKERS, VERDICT, whole_file
-from clamber.meshes import Mesh, body_meshes
+from clamber.meshes import Mesh, body_meshes, body_poses
 from clamber.model import Kinematics
 from clamber.motion import (
     Reading,
@@ -307,12 +307,10 @@ def _motion(
 
 def _poses(kin: Kinematics, meshes: list[Mesh], q: np.ndarray) -> np.ndarray:
     """(n, nb, 7) position [m] and unit quaternion of the drawn bodies."""
-    bodies = [m.body for m in meshes]
-    out = np.zeros((len(q), len(bodies), 7))
+    out = np.zeros((len(q), len(meshes), 7))
     for i, posture in enumerate(q):
         kin.update(posture)
-        out[i, :, :3] = kin.data.xpos[bodies]
-        out[i, :, 3:] = kin.data.xquat[bodies]
+        out[i] = body_poses(kin.data, meshes)
     return out
 
 

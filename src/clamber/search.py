@@ -90,32 +90,18 @@ def plan_steps(
         report("plan", k / len(steps), str(step.move))
         result = plan_step(ik, keyframes[-1], step, method, options, lap)
         if not isinstance(result, str):
-            roomier = None
+            made, done = [result], [*done, k]
             if mended < MAX_REPAIRS and _margin(result[1]) < MARGINS[0]:
-                roomier = _roomier(
-                    ik,
-                    keyframes,
-                    paths,
-                    [steps[i] for i in done],
-                    step,
-                    method,
-                    options,
-                    lap,
-                )
-            if roomier is not None:
-                mended += 1
-                j, again, made = roomier
-                for i, changed in zip([*done[j:], k], again, strict=True):
-                    steps[i] = changed
-                del keyframes[j + 1 :], paths[j:]
-                keyframes += [key for key, _ in made]
-                paths += [path for _, path in made]
-                done.append(k)
-                k += 1
-                continue
-            keyframes.append(result[0])
-            paths.append(result[1])
-            done.append(k)
+                making = [steps[i] for i in done]
+                roomier = _roomier(ik, keyframes, paths, making, method, options, lap)
+                if roomier is not None:
+                    mended += 1
+                    j, again, made = roomier
+                    for i, changed in zip(done[j:], again, strict=True):
+                        steps[i] = changed
+                    del keyframes[j + 1 :], paths[j:]
+            keyframes += [key for key, _ in made]
+            paths += [path for _, path in made]
             k += 1
             continue
         better = None
@@ -130,8 +116,7 @@ def plan_steps(
         places, guide = better
         steps[k] = replace(step, guide=guide)
         for j, contact in places.items():
-            firm = replace(steps[done[j]].move, makes=contact, firm=True)
-            steps[done[j]] = replace(steps[done[j]], move=firm)
+            steps[done[j]] = _placed(steps[done[j]], contact)
         j = min(places)
         k = done[j]
         del keyframes[j + 1 :], paths[j:], done[j:]
@@ -145,29 +130,35 @@ def _margin(path: Path) -> float:
     return path.transition.margin
 
 
+def _placed(step: Step, contact: Contact) -> Step:
+    """The step, its contact made there and nowhere else."""
+    return replace(step, move=replace(step.move, makes=contact, firm=True))
+
+
 def _roomier(
     ik: IK,
     keyframes: list[Keyframe],
     paths: list[Path],
-    done: list[Step],
-    step: Step,
+    making: list[Step],
     method: str,
     options: KeyframeOptions,
     lap: Callable[[str], None],
 ) -> tuple[int, list[Step], list[tuple[Keyframe, Path]]] | None:
     """A step with the largest margin, for which earlier contacts are put elsewhere.
 
+    `making` holds the step of each path, and last the one to find more room for.
+
     Returns:
-        The first path to be replaced, its step and those after it up to `step`, and
-        what has been planned for them; None where that does not help.
+        The first path to be replaced, its step and those after it, and what has been
+        planned for them; None where that does not help.
     """
+    step = making[-1]
     for places, guide in repairs(ik, keyframes, paths, step.move, margin=MARGINS[0]):
         lap("repairs")
         j = min(places)
-        again = [*done[j:], replace(step, guide=guide)]
+        again = [*making[j:-1], replace(step, guide=guide)]
         for i, contact in places.items():
-            firm = replace(again[i - j].move, makes=contact, firm=True)
-            again[i - j] = replace(again[i - j], move=firm)
+            again[i - j] = _placed(again[i - j], contact)
         key, made = keyframes[j], []
         for s in again:
             least = MARGINS[0] if s is again[-1] else _margin(paths[j + len(made)])

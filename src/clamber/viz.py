@@ -31,7 +31,7 @@ from PIL import Image, ImageDraw, ImageFont
 from clamber.contact import Contact, ContactSequence
 from clamber.demo import Demonstration
 from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.io import NO_TRAJECTORY, ROLLOUT, load_plan, load_rollout, whole_file
+from clamber.io import ROLLOUT, load_plan, load_rollout, trajectory_of, whole_file
 from clamber.model import Kinematics, Robot, World, build_world
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
@@ -817,6 +817,11 @@ def stability_of(
     return d, limit, margin
 
 
+def row_at(times: np.ndarray, t: float) -> int:
+    """Index of the last of rising times (n,) up to `t` [s]; 0 before the first."""
+    return max(0, int(np.searchsorted(times, t + 1e-9, side="right")) - 1)
+
+
 def bearing_of(kin: Kinematics, surface: str, support: Support) -> np.ndarray:
     """(k, 3) points of a surface that bear on a support; the nearest one at least."""
     points = kin.bearing_points(surface, support.normal)
@@ -1076,17 +1081,13 @@ def render_frame(
         world, t, q = motion.world, motion.time, motion.qpos
     else:
         plan = load_plan(folder)
-        if plan.trajectory is None:
-            raise InputError(
-                NO_TRAJECTORY,
-                source=folder,
-            )
-        world, t, q = plan.world, plan.trajectory.time, plan.trajectory.q
+        trajectory = trajectory_of(plan, folder)
+        world, t, q = plan.world, trajectory.time, trajectory.q
     if not t[0] <= time <= t[-1]:
         raise InputError(
             f"a time from {t[0]:g} to {t[-1]:.2f} s", source="--frame", value=time
         )
-    row = int(np.searchsorted(t, time + 1e-9, side="right")) - 1
+    row = row_at(t, time)
     path = folder / f"frame-{time:g}.png" if out is None else Path(out)
     if path.suffix != ".png":
         raise InputError("a name that ends in .png", source=path)

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from clamber.contact import ContactSequence
+from clamber.contact import ContactSequence, Stance
 from clamber.demo import PARTS
 from clamber.demo.demonstration import SIDES
 from clamber.motion import Motion, peaks
 from clamber.view.person import Person
 from clamber.view.shown import Frame, Shown
-from clamber.viz import PHASE_COLOURS
+from clamber.viz import PHASE_COLOURS, row_at
 
 GO_TO = "go to [s]"  # the field; a time after `@` is one that was clicked
 CLICKED = "@"
@@ -116,8 +116,7 @@ def clock(shown: Shown, frame: Frame) -> str:
     if math.isfinite(frame.margin):
         facts.append(f"CoM margin <b>{1000 * frame.margin:.0f} mm</b>")
     m = shown.motion
-    row = int(np.searchsorted(m.time, frame.time + 1e-9, side="right")) - 1
-    row = max(0, min(row, len(m.time) - 1))
+    row = row_at(m.time, frame.time)
     if m.effort is not None:
         j = int(np.abs(m.effort[row]).argmax())
         name = escaped(m.world.joints[j])
@@ -412,13 +411,18 @@ def recording_clock(person: Person, t: float) -> str:
         stance = int(np.searchsorted(person.sequence.t, t + 1e-6, side="right")) - 1
         stance = min(stance, len(person.sequence.stances) - 1)
         if stance >= 0:
-            on = person.sequence.stances[stance].contacts
-            text = ", ".join(f"{c.surface} on {c.support}" for c in on) or "in the air"
+            text = _resting(person.sequence.stances[stance])
     return (
         f"<style>:root{{--clamber-at:{_along(times, t) / 10:.2f}%}}"
         f".clamber-s{stance}{{background:var(--soft)}}</style>"
         + block(f"<p><b>{t:.2f} s</b></p>", f'<p class="dim">{escaped(text)}</p>')
     )
+
+
+def _resting(stance: Stance) -> str:
+    """Which surfaces are on what."""
+    on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
+    return on or "in the air"
 
 
 def sequence_table(sequence: ContactSequence, *, jumps: bool) -> str:
@@ -432,10 +436,9 @@ def sequence_table(sequence: ContactSequence, *, jumps: bool) -> str:
     for i, stance in enumerate(sequence.stances):
         t = float(sequence.t[i])
         go = f' data-t="{t:.3f}"' if jumps else ""
-        on = ", ".join(f"{c.surface} on {c.support}" for c in stance.contacts)
         bodies.append(
             f'<tbody class="clamber-s{i}"{go} data-stance="{i}"><tr><td>{i}</td>'
-            f'<td style="text-align:left">{escaped(on or "in the air")}</td>'
+            f'<td style="text-align:left">{escaped(_resting(stance))}</td>'
             f"<td>{t:.1f} s</td></tr></tbody>"
         )
     on = escaped(ON_ROW)

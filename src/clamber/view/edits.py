@@ -23,7 +23,7 @@ from clamber.io import (
     save_sequence,
     save_verdict,
 )
-from clamber.moves import SAME_PLACE, Step, split_moves
+from clamber.moves import Step, same_place, split_moves
 from clamber.pipeline import Plan, plan
 from clamber.scene import Support
 from clamber.simulation import Rollout, Verdict
@@ -89,7 +89,7 @@ def spells_of(made: Plan) -> tuple[Spell, ...]:
             if c is None:
                 i += 1
                 continue
-            while j < len(column) and _same(c, column[j]):
+            while j < len(column) and (d := column[j]) and same_place(c, d):
                 j += 1
             if i > 0:
                 key = planned.get((i, surface))
@@ -104,11 +104,6 @@ def spells_of(made: Plan) -> tuple[Spell, ...]:
                 )
             i = j
     return tuple(sorted(out, key=lambda s: s.first))
-
-
-def _same(a: Contact, b: Contact | None) -> bool:
-    near = b is not None and float(np.linalg.norm(a.position - b.position)) < SAME_PLACE
-    return near and b is not None and a.support == b.support
 
 
 def keyframe_steps(made: Plan) -> list[tuple[int, Step]]:

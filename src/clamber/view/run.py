@@ -194,7 +194,7 @@ class _Editor:
         replaced: Callable[[Plan | None, tuple[Rollout, Verdict] | None], None],
     ) -> None:
         self._page, self._run, self._made, self._replaced = page, run, made, replaced
-        self._spells = {s.name: i for i, s in enumerate(spells_of(made))}
+        self._spells = spells_of(made)
         self._edits = Edits()
         self._new: Plan | None = None
         self._done: tuple[Rollout, Verdict] | None = None
@@ -209,7 +209,9 @@ class _Editor:
             for s in made.world.surfaces
             if any(s in x.surfaces for x in made.sequence.stances)
         ]
-        self._choice = gui.add_dropdown("move", (NOTHING, *self._spells))
+        self._choice = gui.add_dropdown(
+            "move", (NOTHING, *(s.name for s in self._spells))
+        )
         self._use = {s: gui.add_checkbox(f"use {s}", True) for s in surfaces}
         self._replan = gui.add_button("Re-plan")
         self._simulate = gui.add_button("Simulate", disabled=True)
@@ -237,8 +239,9 @@ class _Editor:
 
     def _spell(self) -> tuple[int, Spell] | None:
         """The contact that is chosen."""
-        index = self._spells.get(str(self._choice.value))
-        return None if index is None else (index, spells_of(self._made)[index])
+        chosen = str(self._choice.value)
+        named = (x for x in enumerate(self._spells) if x[1].name == chosen)
+        return next(named, None)
 
     def _choose(self) -> None:
         """Put the gizmo on the contact that is chosen."""
@@ -272,7 +275,7 @@ class _Editor:
 
     def _tell(self, *more: str, wrong: str = "") -> None:
         """What is edited, and what came of it."""
-        spells = spells_of(self._made)
+        spells = self._spells
         said = [
             f"{spells[i].name}: moved by "
             f"{1000 * np.linalg.norm(p - spells[i].planned):.0f} mm"

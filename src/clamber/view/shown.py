@@ -8,14 +8,14 @@ Shapes: M states, nq coordinates, nb drawn bodies, nS surfaces, k contacts, m ar
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from clamber.io import keyframe_fields
-from clamber.meshes import Mesh, body_meshes
+from clamber.meshes import Mesh, body_meshes, body_poses
 from clamber.model import Kinematics, World
 from clamber.motion import (
     Motion,
@@ -38,7 +38,7 @@ from clamber.statics import (
     theta_max,
 )
 from clamber.view.edits import keyframe_steps
-from clamber.viz import FORCE_LENGTH, bearing_of, support_below
+from clamber.viz import FORCE_LENGTH, bearing_of, row_at, support_below
 
 PLAN_STRIDE = 10  # samples of a trajectory between two states that are shown
 ELLIPSE_POINTS = 48
@@ -226,12 +226,11 @@ def frame_at(shown: Shown, kin: Kinematics, t: float) -> Frame:
         t: [s]; the state then, or the last one before.
     """
     world = shown.world
-    row = int(np.searchsorted(shown.time, t + 1e-9, side="right")) - 1
-    row = max(0, min(row, len(shown.time) - 1))
+    row = row_at(shown.time, t)
     ghost = None
     if shown.reference is not None:
         kin.update(shown.reference[row])
-        ghost = _poses(kin, shown.meshes)
+        ghost = body_poses(kin.data, shown.meshes)
     kin.update(shown.q[row])
     stance = stance_at(shown, t)
     static = _static_forces(shown, t, stance)
@@ -278,7 +277,7 @@ def frame_at(shown: Shown, kin: Kinematics, t: float) -> Frame:
     return Frame(
         time=t,
         row=row,
-        poses=_poses(kin, shown.meshes),
+        poses=body_poses(kin.data, shown.meshes),
         ghost=ghost,
         touches=tuple(touches),
         push=_push(shown, kin, row),
@@ -325,12 +324,6 @@ def _static_forces(shown: Shown, t: float, stance: int) -> Mapping[str, np.ndarr
             known = {c["surface"]: c["force"] for c in contacts}
             return {s: np.array(f) for s, f in known.items() if f is not None}
     return {}
-
-
-def _poses(kin: Kinematics, meshes: Sequence[Mesh]) -> np.ndarray:
-    """(nb, 7) position [m] and unit quaternion of the drawn bodies."""
-    bodies = [m.body for m in meshes]
-    return np.concatenate([kin.data.xpos[bodies], kin.data.xquat[bodies]], axis=1)
 
 
 def _push(shown: Shown, kin: Kinematics, row: int) -> np.ndarray | None:

@@ -157,13 +157,31 @@ def _cylinder(radius: float, height: float, top: float) -> tuple[np.ndarray, ...
     return vertices, faces
 
 
-class Discs:
-    """Contacts of at most `most` surfaces, coloured by phase."""
+class Marks:
+    """A mark at each of at most `most` contacts, coloured by phase."""
 
-    def __init__(self, server: viser.ViserServer, name: str, most: int) -> None:
-        """Send one disc, of which there are `most`."""
-        vertices, faces = _cylinder(DISC, DISC_HEIGHT, 1.0)
-        self._most = most
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        name: str,
+        most: int,
+        shape: tuple[np.ndarray, ...],
+        *,
+        by_friction: bool = False,
+        **look: Any,
+    ) -> None:
+        """Send one mark, of which there are `most`.
+
+        Args:
+            server: Whose scene.
+            name: Of the node.
+            most: Contacts at most.
+            shape: Vertices and triangles, the contact's normal along z.
+            by_friction: They are as wide as the contact's friction, times their shape.
+            look: Of the material.
+        """
+        vertices, faces = shape
+        self._most, self._by_friction = most, by_friction
         self.node = server.scene.add_batched_meshes_simple(
             name,
             vertices,
@@ -174,59 +192,36 @@ class Discs:
             batched_colors=np.zeros((most, 3), dtype=np.uint8),
             lod="off",
             cast_shadow=False,
+            **look,
         )
 
     def show(self, touches: Sequence[Touch]) -> None:
         """Put them at the contacts."""
-        p, q, scale, colour = _placed(self._most, touches)
+        most = self._most
+        p: np.ndarray = np.zeros((most, 3))
+        scale: np.ndarray = np.full((most, 3), HIDDEN)
+        q = np.tile([1.0, 0.0, 0.0, 0.0], (most, 1))
+        colour = np.zeros((most, 3), dtype=np.uint8)
+        for i, touch in enumerate(touches[:most]):
+            p[i] = touch.position + LIFT * touch.normal
+            q[i] = quat_from_matrix(frame_from_normal(touch.normal, [1.0, 0.0, 0.0]))
+            wide = touch.friction if self._by_friction else 1.0
+            scale[i] = [wide, wide, 1.0]
+            colour[i] = PHASE_COLOURS[touch.phase]
         self.node.batched_positions, self.node.batched_wxyzs = p, q
         self.node.batched_scales, self.node.batched_colors = scale, colour
 
 
-class Cones:
+def discs(server: viser.ViserServer, name: str, most: int) -> Marks:
+    """Contacts."""
+    return Marks(server, name, most, _cylinder(DISC, DISC_HEIGHT, 1.0))
+
+
+def cones(server: viser.ViserServer, name: str, most: int) -> Marks:
     """Friction cones of contacts: the forces that do not slip lie inside."""
-
-    def __init__(self, server: viser.ViserServer, name: str, most: int) -> None:
-        """Send one cone of friction 1, of which there are `most`."""
-        vertices, faces = _cylinder(1e-3, CONE_HEIGHT, CONE_HEIGHT / 1e-3)
-        self._most = most
-        self.node = server.scene.add_batched_meshes_simple(
-            name,
-            vertices,
-            faces,
-            np.tile([1.0, 0.0, 0.0, 0.0], (most, 1)),
-            np.zeros((most, 3)),
-            batched_scales=np.full((most, 3), HIDDEN),
-            batched_colors=np.zeros((most, 3), dtype=np.uint8),
-            lod="off",
-            opacity=0.3,
-            side="double",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-
-    def show(self, touches: Sequence[Touch]) -> None:
-        """Put them at the contacts, as wide as their friction."""
-        p, q, scale, colour = _placed(self._most, touches)
-        for i, touch in enumerate(touches[: self._most]):
-            scale[i] = [touch.friction, touch.friction, 1.0]
-        self.node.batched_positions, self.node.batched_wxyzs = p, q
-        self.node.batched_scales, self.node.batched_colors = scale, colour
-
-
-def _placed(
-    most: int, touches: Sequence[Touch]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Position, orientation, scale and colour of the parts of a node."""
-    p, scale = np.zeros((most, 3)), np.full((most, 3), HIDDEN)
-    q = np.tile([1.0, 0.0, 0.0, 0.0], (most, 1))
-    colour = np.zeros((most, 3), dtype=np.uint8)
-    for i, touch in enumerate(touches[:most]):
-        p[i] = touch.position + LIFT * touch.normal
-        q[i] = quat_from_matrix(frame_from_normal(touch.normal, [1.0, 0.0, 0.0]))
-        scale[i] = 1.0
-        colour[i] = PHASE_COLOURS[touch.phase]
-    return p, q, scale, colour
+    cone = _cylinder(1e-3, CONE_HEIGHT, CONE_HEIGHT / 1e-3)  # of friction 1
+    look: dict[str, Any] = {"opacity": 0.3, "side": "double", "receive_shadow": False}
+    return Marks(server, name, most, cone, by_friction=True, **look)
 
 
 class Balance:
@@ -306,8 +301,8 @@ class Stage:
             self._ghost = Links(
                 server, f"{root}/ghost", world, shown.meshes, ghost=True
             )
-        self._discs = Discs(server, f"{root}/contacts", most)
-        self._cones = Cones(server, f"{root}/cones", most)
+        self._discs = discs(server, f"{root}/contacts", most)
+        self._cones = cones(server, f"{root}/cones", most)
         self._arrows = add.add_arrows(
             f"{root}/forces",
             np.zeros((1, 2, 3)),
@@ -377,10 +372,8 @@ class Stage:
             colours.append(PUSH)
         self._arrows.visible = bool(arrows) and self._layers["forces"]
         if self._arrows.visible:
-            if len(arrows) != len(self._arrows.points):
-                self._arrows.colors = np.array(colours, dtype=np.uint8)
-            self._arrows.points = np.array(arrows)
             self._arrows.colors = np.array(colours, dtype=np.uint8)
+            self._arrows.points = np.array(arrows)
 
 
 class Stick:
@@ -432,7 +425,7 @@ class Stick:
             batched_colors=PERSON,
             **common,
         )
-        self._discs = Discs(server, f"{root}/contacts", MOST_PARTS)
+        self._discs = discs(server, f"{root}/contacts", MOST_PARTS)
 
     def show(self, figure: Figure) -> None:
         """Put the person where it is; bones that were not seen are not shown."""
