@@ -806,7 +806,7 @@ def test_more_samples_than_16_bits_hold_are_written_and_read(tmp_path):
 
 def test_a_real_motive_file_is_read(shared, tmp_path):
     path = shared / "demos" / "motive-sample" / "pathviewr_motive_example_data.csv"
-    with pytest.raises(InputError, match=r"line 637 .* found 72838 and then 76400"):
+    with pytest.raises(InputError, match=r"line 637: .* found 72838 and then 76400"):
         read_points(path)  # it was put together from several stretches
     lines = path.read_bytes().splitlines(keepends=True)
     path = tmp_path / "first.csv"
