@@ -30,8 +30,8 @@ from clamber.adaptation import (
 )
 from clamber.contact import Contact
 from clamber.control import JointLaw
-from clamber.model import PHYSICS_STEP, Kinematics, World, chain_up
 from clamber.leaning import Lean, is_leaning, leaning_part, strikes, striking_part
+from clamber.model import PHYSICS_STEP, Kinematics, World, chain_up
 from clamber.moves import split_moves
 from clamber.pipeline import Midway, Plan
 from clamber.posture.keyframe import Keyframe

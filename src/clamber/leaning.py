@@ -91,7 +91,9 @@ def striking_part(kin: Kinematics, surfaces: Collection[str]) -> Lean | None:
     return min((lean for lean, _ in near), key=lambda x: x.distance, default=None)
 
 
-def _near_supports(kin: Kinematics, active: np.ndarray) -> list[tuple[Lean, np.ndarray]]:
+def _near_supports(
+    kin: Kinematics, active: np.ndarray
+) -> list[tuple[Lean, np.ndarray]]:
     """Parts near a support among pairs (P,), each with its nearest point (3,)."""
     world = kin.world
     supports = list(world.support_of_geom)
