@@ -73,7 +73,7 @@ def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | Non
     moment = -(np.cross(kin.com, down) + np.cross(points, load).sum(axis=0))
     own = [g for s in world.surfaces.values() for g in s.geoms]
     best, found = SEARCHED + AWAY, None
-    for lean, p in _near_supports(kin, ~np.isin(world.pairs, own).any(axis=1)):
+    for lean, p in _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) == 0):
         # p x F = M in the plane z = p_z.
         x = (p[2] * force[0] - moment[1]) / force[2]
         y = (p[2] * force[1] + moment[0]) / force[2]
@@ -87,7 +87,7 @@ def striking_part(kin: Kinematics, surfaces: Collection[str]) -> Lean | None:
     """The geom of some surfaces that is nearest to a support; None where none is."""
     world = kin.world
     own = [g for s in surfaces for g in world.surfaces[s].geoms]
-    near = _near_supports(kin, np.isin(world.pairs, own).any(axis=1))
+    near = _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) > 0)
     return min((lean for lean, _ in near), key=lambda x: x.distance, default=None)
 
 
