@@ -13,6 +13,8 @@ from clamber.model import Kinematics, World, build_world, load_robot
 from clamber.posture.ik import (
     DAMPING,
     EDGE_INSET,
+    EDGE_ROOM,
+    EDGE_WEIGHT,
     IK,
     PENALTY,
     ROUGHNESS_WEIGHT,
@@ -753,6 +755,72 @@ def test_a_link_in_contact_with_what_is_rough_is_as_near_as_its_contact(rough):
     other = goal_at(rough, q, "RHand", "ground")
     problem = replace(wanted, goals=(other,))
     assert rough.build(problem, q).merit == pytest.approx(free, rel=1e-6)
+
+
+def test_a_part_that_is_known_to_have_touched_keeps_off_by_so_much_more(world):
+    """Of a smooth box too, that pair alone, also where its link is in contact."""
+    hand = world.model.geom("LHand").id
+    ik = IK(world, {(hand, "yawed"): 0.05})
+    q = hand_over(ik, "yawed", 0.02)
+    wanted = problem_of(world, clearance=only(world, "LHand", 0.01))
+    cost = 0.5 * (ROUGHNESS_WEIGHT * 0.04) ** 2
+    assert ik.build(wanted, q).merit == pytest.approx(cost, rel=1e-6)
+    held = replace(wanted, goals=(goal_at(ik, q, "LHand", "yawed"),))
+    away = ik.build(replace(held, clearance=only(world, "RHand", 0.01)), q).merit
+    assert ik.build(held, q).merit - away == pytest.approx(cost, rel=1e-6)
+    for geom, box in (("RHand", "yawed"), ("LHand", "tilted")):
+        other = IK(world, {(world.model.geom(geom).id, box): 0.05})
+        assert other.build(wanted, q).merit == 0.0
+
+
+def test_the_larger_of_roughness_and_of_what_is_known_counts(rough):
+    hand = rough.world.model.geom("LHand").id
+    q = hand_over(rough, "yawed", 0.02)
+    problem = problem_of(rough.world, clearance=only(rough.world, "LHand", 0.01))
+    for more, total in ((0.01, 0.03), (0.05, 0.05)):
+        merit = IK(rough.world, {(hand, "yawed"): more}).build(problem, q).merit
+        short = 0.01 + total - 0.02
+        assert merit == pytest.approx(0.5 * (ROUGHNESS_WEIGHT * short) ** 2, rel=1e-6)
+
+
+# Room to slip: a soft task of a free round contact.
+
+
+def near_border(ik: IK, room: float) -> np.ndarray:
+    """(nq,) the left hand on the yawed box, so far inside its first border."""
+    A, b = ik.world.supports["yawed"].edges()
+    q = hand_over(ik, "yawed", 0.0)
+    ik.kin.update(q)
+    p = ik.kin.contact_point("LHand", ik.world.supports["yawed"].normal)
+    q[:3] += A[0] * (b[0] - A[0] @ p - room)
+    return q
+
+
+@pytest.mark.parametrize("room", [0.016, 0.03, 0.044])
+def test_too_near_a_border_costs_the_square_of_what_is_missing(ik, room):
+    q = near_border(ik, room)
+    free = problem_of(ik.world, goal_at(ik, q, "LHand", "yawed", free=True))
+    cost = 0.5 * (EDGE_WEIGHT * (EDGE_ROOM - room)) ** 2
+    assert ik.build(free, q).merit == pytest.approx(cost, rel=1e-6)
+
+    def alone(x: np.ndarray) -> float:
+        ik.kin.update(x)
+        s = ik.world.supports["yawed"]
+        A, b = s.edges()
+        short = EDGE_ROOM - (b - A @ ik.kin.contact_point("LHand", s.normal)).min()
+        return 0.5 * (EDGE_WEIGHT * short) ** 2
+
+    numeric = jacobian(ik, q, alone, 1e-5)
+    np.testing.assert_allclose(ik.build(free, q).c, numeric, atol=1e-6)
+    held = problem_of(ik.world, goal_at(ik, q, "LHand", "yawed"))
+    assert ik.build(held, q).merit == pytest.approx(0.0, abs=1e-9)
+
+
+def test_farther_inside_no_border_counts(ik):
+    q = near_border(ik, EDGE_ROOM + 1e-4)
+    free = problem_of(ik.world, goal_at(ik, q, "LHand", "yawed", free=True))
+    assert ik.build(free, q).merit == pytest.approx(0.0, abs=1e-9)
+    assert not ik.build(free, q).c.any()
 
 
 def test_over_what_is_rough_a_limb_keeps_farther_away_where_it_can(plain):

@@ -8,8 +8,9 @@ was planned is a trajectory of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -36,6 +37,7 @@ FEELING_SPEED = 0.06  # [m/s] along the normal
 FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
 FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
+NOTHING: Mapping[tuple[int, str], float] = MappingProxyType({})
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
@@ -80,7 +82,13 @@ def felt_contact(kin: Kinematics, c: Contact) -> Contact:
     )
 
 
-def adapt_plan(plan: Plan, scene: Scene, now: Midway, commanded: np.ndarray) -> Adapted:
+def adapt_plan(
+    plan: Plan,
+    scene: Scene,
+    now: Midway,
+    commanded: np.ndarray,
+    wary: Mapping[tuple[int, str], float] = NOTHING,
+) -> Adapted:
     """Take a stance as it is and plan the steps that are left.
 
     Args:
@@ -89,18 +97,25 @@ def adapt_plan(plan: Plan, scene: Scene, now: Midway, commanded: np.ndarray) -> 
             roughness asks for, that is not kept.
         now: Where the robot is.
         commanded: (nq,) reference at present; the new one begins there.
+        wary: How much farther parts stay from supports, see `IK`; likewise.
     """
-    found = _adapt(plan, scene, now, commanded)
-    if found.missed and any(b.roughness > 0 for b in scene.boxes):
+    found = _adapt(plan, scene, now, commanded, wary)
+    if found.missed and (wary or any(b.roughness > 0 for b in scene.boxes)):
         smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
-        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded)
+        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NOTHING)
         if not other.missed or len(other.keyframes) > len(found.keyframes):
             return other
     return found
 
 
-def _adapt(plan: Plan, scene: Scene, now: Midway, commanded: np.ndarray) -> Adapted:
-    ik = IK(build_world(plan.world.robot, scene))
+def _adapt(
+    plan: Plan,
+    scene: Scene,
+    now: Midway,
+    commanded: np.ndarray,
+    wary: Mapping[tuple[int, str], float],
+) -> Adapted:
+    ik = IK(build_world(plan.world.robot, scene), wary)
     settled = settle(ik, now, commanded, plan.options)
     if isinstance(settled, str):
         return Adapted(world=ik.world, trajectory=None, keyframes=(), missed=settled)

@@ -30,6 +30,7 @@ from clamber.adaptation import (
 )
 from clamber.contact import Contact
 from clamber.control import JointLaw
+from clamber.leaning import Lean, is_leaning, leaning_part, strikes, striking_part
 from clamber.model import PHYSICS_STEP, Kinematics, World, chain_up
 from clamber.moves import split_moves
 from clamber.pipeline import Midway, Plan
@@ -55,6 +56,10 @@ EASING = 0.5  # [s] from held to self-positioned
 BLEND = 0.3  # [s] back to a trajectory that was left
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SAME_PLACE = 0.05  # [m] a surface that is felt again this near replaces what was felt
+LEANING = 0.1  # [s] a part bears for so long where it should not: it leans
+LEAN_STRIDE = 10  # physics steps between two looks at that
+KEPT_OFF = 0.02  # [m] farther than where it leant
+WITHDRAWALS = 4  # as often another way is looked for
 
 Ticks = Iterator[None]
 
@@ -71,6 +76,7 @@ class Event:
 class _Leg:
     """One step of a trajectory, from a keyframe to the next, in samples."""
 
+    begin: int  # sample of the keyframe before
     swing: int  # first sample with the limb in the air
     touch: int  # last sample before the new contact is closed
     end: int
@@ -135,6 +141,11 @@ class Execution:
         by_policy = plan.policy is not None
         self._steps = () if by_policy else split_moves(plan.sequence, plan.world)[0]
         self._felt: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
+        self._weight = 0.0  # [N] as felt
+        self._leaning = 0.0  # [s] so long
+        self._wary: dict[tuple[int, str], float] = {}
+        self._lean: Lean | None = None
+        self._withdrawals = 0
         self._scale = 1.0  # of the torques: mass as felt over mass as described
         self._pose = plan.trajectory.q[0].copy()
         self._load = np.zeros((len(self._surfaces), 3))
@@ -194,6 +205,8 @@ class Execution:
                 yield from self._step()
             elif self._more:
                 yield from self._go_ahead()
+            elif self._leans():
+                yield from self._withdraw(self._i)
             else:
                 break
         if self._missed and not self.stopped:
@@ -205,11 +218,14 @@ class Execution:
         leg = self._legs[self._leg]
         c = leg.made
         if c is not None:
-            yield from self._play(leg.swing)
             near = 0.5 * (leg.swing + leg.touch)
             yield from self._play(
-                leg.touch, until=lambda: self._i > near and self._touches(c)
+                leg.touch,
+                until=lambda: (self._i > near and self._touches(c)) or self._leans(),
             )
+            if self._lean is not None:
+                yield from self._withdraw(leg.begin)
+                return
             if self._i < leg.touch and self._off(c)[0] > DEVIATION:
                 yield from self._take(c)
                 return
@@ -232,6 +248,20 @@ class Execution:
         stance = self._keyframes[self._leg].stance
         self._remember([c for c in stance if self._force(c) >= LOST])
         yield from self._check_stance()
+
+    def _withdraw(self, to: int) -> Ticks:
+        """A part bears where it should not: back, and on with more distance of it."""
+        m, lean = self._world.model, self._lean
+        assert lean is not None
+        self._lean = None
+        link = m.body(m.geom_bodyid[lean.geom]).name
+        self._note(f"{link} leans on {lean.support}: back, to keep it farther away")
+        key = lean.geom, lean.support
+        self._wary[key] = KEPT_OFF + max(lean.distance, self._wary.get(key, 0.0))
+        self._withdrawals += 1
+        yield from self._back(to)
+        stance = tuple(self._other(c) or c for c in self._keyframes[self._leg].stance)
+        yield from self._replan(stance, stance)
 
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
@@ -264,7 +294,7 @@ class Execution:
 
     def _check_start(self) -> Ticks:
         """Is the robot where it should be, and as heavy?"""
-        weight = float(self._load[:, 2].sum())
+        weight = self._weight = float(self._load[:, 2].sum())
         ratio = weight / (9.81 * self._world.mass)
         if abs(ratio - 1.0) > MASS_CHANGE:
             self._note(f"weighs {100 * ratio:.0f} % of what its description says")
@@ -343,6 +373,15 @@ class Execution:
             self._blend()
             yield
 
+    def _back(self, to: int) -> Ticks:
+        """Follow the trajectory back to sample `to`."""
+        self._left_plan = True
+        while self._i > to:
+            self._i -= 1
+            self._set(self._trajectory, self._i)
+            self._velocity = -self._velocity
+            yield
+
     def _set(self, t: Trajectory, i: int) -> None:
         self.reference, self._torque = t.q[i], t.tau[i]
         self._velocity, self._closed = t.v[i, self._dadr], t.contact[i]
@@ -410,7 +449,9 @@ class Execution:
             loaded=tuple(c for c, b in zip(felt, bearing, strict=True) if b),
             q=self._rebased(),
         )
-        found = adapt_plan(self._plan, self._believed(), now, self.reference)
+        found = adapt_plan(
+            self._plan, self._believed(), now, self.reference, self._wary
+        )
         yield from self._rest(THINKING)
         yield from self._follow(found, off)
 
@@ -482,6 +523,31 @@ class Execution:
             q[3:7] *= -1
         q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
         q[3:7] /= np.linalg.norm(q[3:7])
+
+        if self._k % LEAN_STRIDE == 0:
+            lasts = is_leaning(self._load, self._weight) or len(self._struck()) > 0
+            self._leaning += LEAN_STRIDE * PHYSICS_STEP if lasts else -self._leaning
+
+    def _struck(self) -> list[str]:
+        """Surfaces, neither in contact nor about to be, that strike a side."""
+        j = self._leg
+        near = {c.surface for key in self._keyframes[j : j + 2] for c in key.stance}
+        if j < len(self._legs) and (made := self._legs[j].made) is not None:
+            near.update(self._plan.world.robot.limb_of(made.surface).surfaces)
+        hit = np.flatnonzero(strikes(self._load))
+        return [s for i in hit if (s := self._surfaces[i]) not in near]
+
+    def _leans(self) -> bool:
+        """Whether something leans where it should not: then `_lean` says what."""
+        if self._leaning < LEANING or self._withdrawals == WITHDRAWALS:
+            return False
+        self._leaning = 0.0
+        self._kin.update(self._pose)
+        if is_leaning(self._load, self._weight):
+            self._lean = leaning_part(self._kin, self._load, self._weight)
+        else:
+            self._lean = striking_part(self._kin, self._struck())
+        return self._lean is not None
 
     def _force(self, c: Contact) -> float:
         """Normal force on a surface [N]."""
@@ -640,7 +706,7 @@ def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
         ]
         rows = slice(ends[j], ends[j + 1] + 1)
         if not made:
-            out.append(_Leg(ends[j], ends[j + 1], ends[j + 1], None))
+            out.append(_Leg(ends[j], ends[j], ends[j + 1], ends[j + 1], None))
             continue
         c = made[0]
         open_ = ~t.contact[rows, t.surfaces.index(c.surface)]
@@ -653,9 +719,10 @@ def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
         air = open_ & ~t.contact[rows][:, gone].any(axis=1)
         k = np.flatnonzero(air)
         if len(k) == 0:
-            out.append(_Leg(ends[j], ends[j + 1], ends[j + 1], None))
+            out.append(_Leg(ends[j], ends[j], ends[j + 1], ends[j + 1], None))
             continue
-        out.append(_Leg(ends[j] + int(k[0]), ends[j] + int(k[-1]), ends[j + 1], c))
+        air = ends[j] + int(k[0]), ends[j] + int(k[-1])
+        out.append(_Leg(ends[j], *air, ends[j + 1], c))
     return out
 
 

@@ -54,6 +54,8 @@ BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
 ROUGHNESS_WEIGHT = 10.0  # soft task: more distance from what is rough
+EDGE_ROOM = 0.045  # [m] ... and should be, where it costs nothing else
+EDGE_WEIGHT = 3.0
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
 SOFT = 8  # daqp's type of a constraint that may give way
 
@@ -285,8 +287,16 @@ class QP:
 class IK:
     """Workspace of the solver: one per world, used again for every posture."""
 
-    def __init__(self, world: World) -> None:
-        """Allocate rows once."""
+    def __init__(
+        self, world: World, wary: Mapping[tuple[int, str], float] = MappingProxyType({})
+    ) -> None:
+        """Allocate rows once.
+
+        Args:
+            world: Robot and scene.
+            wary: How much farther than its clearance a part stays from a support [m],
+                by geom and name of the support: as a task, like the roughness of a box.
+        """
         self.world = world
         self.kin = Kinematics(world)
         nv = world.model.nv
@@ -310,6 +320,12 @@ class IK:
             of_box = world.pairs == world.support_geom[box.name]
             self._rough[of_box.any(axis=1)] = box.roughness
         self._geom_body = world.model.geom_bodyid
+        self._wary = np.zeros(len(world.pairs), dtype=bool)
+        for (geom, support), more in wary.items():
+            pair = geom, world.support_geom[support]
+            mine = np.isin(world.pairs, pair).all(axis=1)
+            self._rough[mine] = np.maximum(self._rough[mine], more)
+            self._wary |= mine
 
     def build(
         self, problem: PostureProblem, q: np.ndarray, reach: float = ACTIVE_RANGE
@@ -611,6 +627,7 @@ class IK:
             jac = kin.point_jacobian(s.body, p)
         else:
             self._inside(A, b, p, jac)
+            self._keep_from_edges(A, b, p, jac)
         T = support.rotation[:, :2].T
         if g.reference > 0:
             self._target(T @ jac, T @ (p - g.position), g.reference)
@@ -639,6 +656,15 @@ class IK:
         self._ineq.J[k] = A[near] @ jac
         self._ineq.hi[k] = room[near]
         self._ineq.lo[k] = -1e30
+
+    def _keep_from_edges(
+        self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray
+    ) -> None:
+        """As a task, room to slip before a round surface is over the border."""
+        room = b - EDGE_ROOM - A @ p
+        near = room < 0.0
+        if near.any():
+            self._target(A[near] @ jac, -room[near], EDGE_WEIGHT)
 
     def _target(self, J: np.ndarray, e: np.ndarray, weight: float) -> None:
         k = self._soft.take(len(e))
@@ -791,7 +817,8 @@ class IK:
     def _roughness_rows(self, problem: PostureProblem) -> None:
         """Keep farther from what is rough, as a task for each pair that is too near.
 
-        The links in contact with it are as near as their contact is.
+        The links in contact with it are as near as their contact is: of those, only
+        what is known to have touched.
         """
         w = self.world
         counts = np.isfinite(problem.clearance) & (self._rough > 0)
@@ -799,7 +826,7 @@ class IK:
             if g.hard:
                 of_link = self._geom_body[w.pairs] == w.surfaces[g.surface].body
                 of_support = w.pairs == w.support_geom[g.support]
-                counts &= ~(of_link.any(axis=1) & of_support.any(axis=1))
+                counts &= ~(of_link.any(axis=1) & of_support.any(axis=1)) | self._wary
         wanted = problem.clearance + self._rough
         near = self.kin.proximity(float(wanted.max(initial=0.0, where=counts)), counts)
         short = np.maximum(wanted[near.pairs] - near.distance, 0.0)
