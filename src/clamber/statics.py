@@ -244,10 +244,13 @@ class SupportEllipse:
             excess: d_com - s, negative inside, zero on the border [m].
             gradient: (2,) its derivative by x and y; a focus itself adds nothing.
         """
-        r = np.asarray(com, dtype=float)[:2] - self.foci
-        d = np.hypot(r[:, 0], r[:, 1])
-        unit = r / np.maximum(d, 1e-12)[:, None]
-        return float(d.sum()) - self.string_length, unit.sum(axis=0)
+        x, y = np.asarray(com, dtype=float)[:2].tolist()
+        total, gx, gy = -self.string_length, 0.0, 0.0
+        for fx, fy in self.foci.tolist():
+            d = math.hypot(x - fx, y - fy)
+            total += d
+            gx, gy = gx + (x - fx) / max(d, 1e-12), gy + (y - fy) / max(d, 1e-12)
+        return total, np.array([gx, gy])
 
 
 def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
@@ -261,39 +264,50 @@ def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
     the largest ellipse that fits at all. Collinear points give the segment, one point
     itself, as ellipses without area: no centre of mass has a negative excess there.
     """
-    v = np.asarray(polygon, dtype=float)
-    if len(v) == 0:
+    v = np.asarray(polygon, dtype=float).tolist()
+    if not v:
         raise ValueError("a polygon without vertices has no ellipse")
-    middle = v.mean(axis=0)
-    r = v - middle
-    nxt = np.concatenate([r[1:], r[:1]])
-    cross = r[:, 0] * nxt[:, 1] - r[:, 1] * nxt[:, 0]
-    area = 0.5 * float(cross.sum())
-    if area <= 1e-12 * float(np.sum(r * r)):
-        half = r[np.argmax(np.sum(r * r, axis=1))]
-        foci = np.stack([middle - half, middle + half])
-        length = float(np.linalg.norm(half))
-        return SupportEllipse(
-            centre=middle,
-            semi_axes=np.array([length, 0.0]),
-            foci=foci,
-            string_length=2 * length,
-        )
-    c = (r + nxt).T @ cross / (6 * area)
-    s = r + nxt
-    # second moments about `middle`, then about the centre of area
-    E = ((r.T * cross) @ r + (nxt.T * cross) @ nxt + (s.T * cross) @ s) / (24 * area)
-    E = E - np.outer(c, c)
-    A, b = polygon_halfplanes(r)
-    k = float(np.min((b - A @ c) ** 2 / np.sum((A @ E) * A, axis=1)))
-    values, vectors = np.linalg.eigh(E)
-    minor, major = np.sqrt(k * np.maximum(values, 0.0)).tolist()
-    focal = math.sqrt(max(major**2 - minor**2, 0.0)) * vectors[:, 1]
-    centre = middle + c
+    mx, my = sum(x for x, _ in v) / len(v), sum(y for _, y in v) / len(v)
+    r = [(x - mx, y - my) for x, y in v]
+    sides = list(zip(r, r[1:] + r[:1], strict=True))
+    area = 0.5 * sum(ax * by - ay * bx for (ax, ay), (bx, by) in sides)
+    if area <= 1e-12 * sum(x * x + y * y for x, y in r):
+        half = max(r, key=lambda p: p[0] * p[0] + p[1] * p[1])
+        return _ellipse((mx, my), math.hypot(*half), 0.0, half)
+    # First and second moments of area about the middle, triangle by triangle.
+    cx = cy = xx = xy = yy = 0.0
+    for (ax, ay), (bx, by) in sides:
+        cross, sx, sy = ax * by - ay * bx, ax + bx, ay + by
+        cx, cy = cx + cross * sx, cy + cross * sy
+        xx += cross * (ax * ax + bx * bx + sx * sx)
+        xy += cross * (ax * ay + bx * by + sx * sy)
+        yy += cross * (ay * ay + by * by + sy * sy)
+    cx, cy = cx / (6 * area), cy / (6 * area)
+    xx, xy, yy = (m / (24 * area) for m in (xx, xy, yy))
+    xx, xy, yy = xx - cx * cx, xy - cx * cy, yy - cy * cy
+    k = math.inf
+    for (ax, ay), (bx, by) in sides:
+        nx, ny = by - ay, ax - bx  # not of unit length: the ratio does not mind
+        room = nx * (ax - cx) + ny * (ay - cy)
+        k = min(k, room * room / (nx * nx * xx + 2 * nx * ny * xy + ny * ny * yy))
+    # Eigenvalues of the symmetric 2 x 2 matrix, and the direction of the larger.
+    half, skew = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    angle = 0.5 * math.atan2(2 * xy, xx - yy)
+    major, minor = math.sqrt(k * (half + skew)), math.sqrt(k * max(half - skew, 0.0))
+    focal = math.sqrt(max(major * major - minor * minor, 0.0))
+    way = (focal * math.cos(angle), focal * math.sin(angle))
+    return _ellipse((mx + cx, my + cy), major, minor, way)
+
+
+def _ellipse(
+    centre: tuple[float, float], major: float, minor: float, focus: tuple[float, float]
+) -> SupportEllipse:
+    """The ellipse with these semi-axes; `focus` is from the centre."""
+    (x, y), (fx, fy) = centre, focus
     return SupportEllipse(
-        centre=centre,
+        centre=np.array([x, y]),
         semi_axes=np.array([major, minor]),
-        foci=np.stack([centre - focal, centre + focal]),
+        foci=np.array([[x - fx, y - fy], [x + fx, y + fy]]),
         string_length=2 * major,
     )
 
