@@ -33,6 +33,7 @@ SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
 IMPRATIO = 10.0  # friction stiffer than normal force: no creep while standing
 BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
 LOOK_RANGE = 0.12  # [m] to which distances are looked at, to know when to look again
+FEW_PAIRS = 40  # that are quicker looked at than bounded
 CLEAR = 0.002  # [m] that they keep from boxes at the start
 DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
 DEFAULT_DAMPING = 3.0  # [N m s/rad] where the description has none
@@ -354,6 +355,8 @@ class World:
         pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
         support_geom: Geom of each support; support_of_geom: the other way, with the
             tiles of an uneven top.
+        touching: By surface and support, the pairs that touch in their contact: those
+            that plan it, and those of the surface's further geoms.
     """
 
     model: mujoco.MjModel
@@ -378,6 +381,7 @@ class World:
     support_geom: Mapping[str, int]
     support_of_geom: Mapping[int, str]
     supports: Mapping[str, Support]
+    touching: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
     base: int
     mass: float
 
@@ -569,6 +573,11 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
             and (model.geom(g).name == s.name or _bears(model.geom(g).name, s.name))
         },
         supports={s.name: s for s in scene.supports},
+        touching={
+            (name, s.name): _touching(model, pairs, surface, model.geom(s.name).id)
+            for name, surface in surfaces.items()
+            for s in scene.supports
+        },
         base=base,
         mass=float(model.body_subtreemass[base]),
     )
@@ -766,6 +775,17 @@ def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
     return np.array(out, dtype=np.int32).reshape(-1, 2)
 
 
+def _touching(
+    model: mujoco.MjModel, pairs: np.ndarray, surface: Surface, support: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the pairs of a surface with a support's geom: planned, further."""
+    mine = np.isin(pairs, surface.geoms).any(axis=1)
+    here = mine & (pairs == support).any(axis=1)
+    main = [g for g in surface.geoms if model.geom(g).name == surface.name]
+    planned = np.isin(pairs, main).any(axis=1) | surface.is_flat
+    return np.flatnonzero(here & planned), np.flatnonzero(here & ~planned)
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proximity:
     """Pairs nearer than the range asked for.
@@ -934,33 +954,13 @@ class Kinematics:
         what its geoms have moved since, say that it is farther.
         """
         m, d = self.world.model, self.data
-        x = self._geom_x
-        apart = x[self._first] - x[self._second]
-        gap = np.sqrt(np.einsum("ij,ij->i", apart, apart)) - self._reach
-        k = self._plane_any
-        gap[k] = np.where(
-            self._plane[k],
-            x[self._second[k], 2]
-            - x[self._first[k], 2]
-            - self._radius[self._second[k]],
-            x[self._first[k], 2] - x[self._second[k], 2] - self._radius[self._first[k]],
-        )
-        for k, box, other in (
-            (self._box_first, self._first, self._second),
-            (self._box_second, self._second, self._first),
-        ):
-            if len(k) == 0:
-                continue
-            b, o = box[k], other[k]
-            R = self._geom_R[b].reshape(-1, 3, 3)
-            local = np.einsum("kij,ki->kj", R, x[o] - x[b])
-            outside = np.maximum(np.abs(local) - m.geom_size[b], 0.0)
-            gap[k] = np.sqrt(np.einsum("ij,ij->i", outside, outside)) - self._radius[o]
-        least = np.maximum(self._least - self._moved(), gap, out=self._least)
-        near = least < reach
-        if active is not None:
-            near &= active
-        idx = np.flatnonzero(near)
+        least = self._least
+        least -= self._moved()
+        counts = True if active is None else active
+        idx = np.flatnonzero((least < reach) & counts)
+        if len(idx) > FEW_PAIRS:
+            np.maximum(least, self._gaps(), out=least)
+            idx = np.flatnonzero((least < reach) & counts)
         far = max(reach, LOOK_RANGE)
         look, rows = mujoco.mj_geomDistance, self._fromto_rows
         distance = np.array(
@@ -986,6 +986,32 @@ class Kinematics:
             first=p[:, :3],
             second=p[:, 3:],
         )
+
+    def _gaps(self) -> np.ndarray:
+        """(P,) what bounding spheres, planes and boxes say that is between pairs."""
+        m, x = self.world.model, self._geom_x
+        apart = x[self._first] - x[self._second]
+        gap = np.sqrt(np.einsum("ij,ij->i", apart, apart)) - self._reach
+        k = self._plane_any
+        gap[k] = np.where(
+            self._plane[k],
+            x[self._second[k], 2]
+            - x[self._first[k], 2]
+            - self._radius[self._second[k]],
+            x[self._first[k], 2] - x[self._second[k], 2] - self._radius[self._first[k]],
+        )
+        for k, box, other in (
+            (self._box_first, self._first, self._second),
+            (self._box_second, self._second, self._first),
+        ):
+            if len(k) == 0:
+                continue
+            b, o = box[k], other[k]
+            R = self._geom_R[b].reshape(-1, 3, 3)
+            local = np.einsum("kij,ki->kj", R, x[o] - x[b])
+            outside = np.maximum(np.abs(local) - m.geom_size[b], 0.0)
+            gap[k] = np.sqrt(np.einsum("ij,ij->i", outside, outside)) - self._radius[o]
+        return gap
 
     def _moved(self) -> np.ndarray:
         """(P,) the most that pairs can have come nearer since this was last asked."""
@@ -1043,10 +1069,10 @@ class Kinematics:
         """(nv,) generalised gravity force that joints and contacts must balance."""
         m, d = self.world.model, self.data
         d.qvel[:] = 0.0
-        d.qacc[:] = 0.0
-        mujoco.mj_fwdPosition(m, d)
-        mujoco.mj_fwdVelocity(m, d)
-        return d.qfrc_bias.copy()
+        mujoco.mj_comVel(m, d)
+        out = np.empty(m.nv)
+        mujoco.mj_rne(m, d, 0, out)
+        return out
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -227,19 +227,10 @@ def contact_clearance(
         geoms of the surface keep `FURTHER_CLEARANCE`.
     """
     out = clearance.copy()
-    name = world.model.geom
     for surface, support in contacts.items():
-        s, g = world.surfaces[surface], world.support_geom[support]
-        mine = np.isin(world.pairs, s.geoms)
-        here = np.isin(world.pairs, [g]).any(axis=1) & mine.any(axis=1)
-        for i in np.flatnonzero(here):
-            a, b = world.pairs[i]
-            geom = int(a if b == g else b)
-            planned = name(geom).name == surface or s.is_flat
-            if not planned:
-                out[i] = FURTHER_CLEARANCE
-            else:
-                out[i] = 0.0 if surface in rolling else -np.inf
+        planned, further = world.touching[surface, support]
+        out[further] = FURTHER_CLEARANCE
+        out[planned] = 0.0 if surface in rolling else -np.inf
     return out
 
 
