@@ -178,6 +178,17 @@ def com_margin(com: ArrayLike, polygon: np.ndarray) -> float:
     return _border(x, y, np.asarray(polygon, dtype=float).tolist())[0]
 
 
+def com_margins(com: np.ndarray, polygon: np.ndarray) -> np.ndarray:
+    """(n,) `com_margin` of many centres of mass (n, 2)."""
+    if len(polygon) < 3:
+        return np.array([com_margin(c, polygon) for c in com])
+    A, b = polygon_halfplanes(polygon)
+    out = (b - com @ A.T).min(axis=1)
+    for i in np.flatnonzero(out < 0.0):
+        out[i] = com_margin(com[i], polygon)
+    return out
+
+
 def _border(
     x: float, y: float, v: list[list[float]]
 ) -> tuple[float, tuple[float, float]]:
@@ -594,7 +605,7 @@ def static_equilibrium(
         for name, dual in zip(owners, duals.tolist(), strict=True):
             yields[name] = max(yields.get(name, 0.0), dual)
         limiting = max(yields, key=lambda name: yields[name])
-        if yields[limiting] <= 10 * LP_WEIGHT:  # it turns about contacts that stay in place
+        if yields[limiting] <= 10 * LP_WEIGHT:  # it turns about contacts that stay
             pivot = names[int(np.argmax(np.linalg.norm(held.forces, axis=1)))]
             limiting = pivot if margin < PUSH_LIMIT - PUSH_TOL else None
     return StaticEquilibrium(
