@@ -16,9 +16,11 @@ from clamber.io import load_plan, save_plan
 from clamber.model import Kinematics, build_world, load_robot
 from clamber.pipeline import Plan, PlanOptions
 from clamber.policy import GeneralPolicy, Option, PelvisDistribution
+from clamber.posture import direct
 from clamber.posture.ik import IK
-from clamber.posture.keyframe import contact_drift
+from clamber.posture.keyframe import KeyframeTask, contact_drift
 from clamber.scene import GROUND, Box, Scene
+from clamber.search import standing
 from clamber.traverse import cost_to_go, follow_policy, plan_traverse
 
 
@@ -359,3 +361,48 @@ def test_a_plan_with_its_policy_survives_disk(crossing, tmp_path):
     assert again.policy is not None
     assert again.policy.options == POLICY.options
     assert again.iterations == crossing.iterations
+
+
+def test_cycles_without_getting_nearer_are_given_up(robot, monkeypatch):
+    world = build_world(robot, scene())
+    ik = IK(world)
+    key = standing(ik, PlanOptions().keyframe)
+    idle = lambda task, key: ([(key, None, "ac3")], "")  # noqa: E731
+    monkeypatch.setattr(module, "_manoeuvre", idle)
+    found = follow_policy(ik, POLICY, key, PlanOptions(), changes=1000)
+    assert "no nearer to the goal" in found.missed
+    assert not found.arrived
+    assert len(found.paths) == module.PATIENCE + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["LKnee", "RElbow"])
+def test_a_limb_that_lost_its_contact_is_set_down_first(crossing, lost):
+    ik = IK(crossing.world)
+    middle = next(
+        k
+        for k in crossing.keyframes
+        if all(c.support == "table" for c in k.stance) and len(k.stance) == 4
+    )
+    held = tuple(c for c in middle.stance if c.surface != lost)
+    task = KeyframeTask(held=held, new=(), q_reference=middle.q)
+    key = direct.optimise(ik, task, middle.q, PlanOptions().keyframe)
+    found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
+    assert not found.missed
+    move = found.paths[0].transition.move
+    assert move.makes.surface == lost
+    assert move.breaks == ()
+    assert len(found.keyframes[-1].stance) == 4
+
+
+@pytest.mark.slow
+def test_a_foot_that_lost_the_ground_is_set_down(robot):
+    bare = Scene(start=np.zeros(3), goal=np.array([0.3, 0.0]))
+    ik = IK(build_world(robot, bare))
+    both = standing(ik, PlanOptions().keyframe)
+    left = tuple(c for c in both.stance if c.surface == "LFoot")
+    task = KeyframeTask(held=left, new=(), q_reference=both.q)
+    key = direct.optimise(ik, task, both.q, PlanOptions().keyframe)
+    found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
+    assert not found.missed
+    assert {c.surface for c in found.keyframes[-1].stance} == {"LFoot", "RFoot"}
