@@ -43,7 +43,14 @@ from clamber.policy import (
 )
 from clamber.posture.ik import IK, PostureProblem
 from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
-from clamber.route import Place, Platform, find_place, find_platforms, goal_of
+from clamber.route import (
+    Place,
+    Platform,
+    find_place,
+    find_platforms,
+    goal_of,
+    room_on,
+)
 from clamber.scene import GROUND, Scene
 from clamber.se3 import matrix_from_quat, quat_from_matrix
 from clamber.search import home_at, plan_step, standing
@@ -121,6 +128,7 @@ class _Build:
         reach: From the feet to an edge, at most [m].
         tall: Height that hands reach, standing [m].
         thigh: [m]
+        round: Radius of what the body takes up while it turns on all fours [m].
     """
 
     step: dict[str, float]
@@ -131,6 +139,7 @@ class _Build:
     reach: float
     tall: float
     thigh: float
+    round: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -638,6 +647,22 @@ def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
     return _Frame(a.xy + way / cycles, a.yaw + share)
 
 
+def _heading(task: _Task, platform: Platform, frame: _Frame, wanted: _Frame) -> _Frame:
+    """`wanted`, or the part of the way there before or after the body can turn.
+
+    Between walls it keeps its yaw; where it can turn now but not there, it does so now.
+    """
+    if abs(_apart(frame.yaw, wanted.yaw)) <= FACING:
+        return wanted
+    room, scene = task.build.round, task.ik.world.scene
+    if room_on(scene, platform.boxes, frame.xy) < room:
+        if np.linalg.norm(frame.xy - wanted.xy) > ARRIVED:
+            return _Frame(wanted.xy, frame.yaw)
+    elif room_on(scene, platform.boxes, wanted.xy) < room:
+        return _Frame(frame.xy, wanted.yaw)
+    return wanted
+
+
 def _share(a: _Frame, b: _Frame, share: float) -> _Frame:
     """A part of the way from one to the other."""
     return _Frame(a.xy + share * (b.xy - a.xy), a.yaw + share * (b.yaw - a.yaw))
@@ -653,7 +678,7 @@ def _crawl(
     """One cycle towards `wanted`."""
     option = next(o for o in task.policy.options if o.region == "O")
     step = _crawl_step(task)
-    full = _between(frame, wanted, step, TURN)
+    full = _between(frame, _heading(task, platform, frame, wanted), step, TURN)
     tries = (
         full,
         _share(frame, full, 0.5),
@@ -1064,6 +1089,8 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
         reach=STAND * leg + REACH * arm,
         tall=leg + trunk + arm,
         thigh=thigh,
+        # The shanks trail behind the knees.
+        round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
     )
 
 
