@@ -406,3 +406,32 @@ def test_a_foot_that_lost_the_ground_is_set_down(robot):
     found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
     assert not found.missed
     assert {c.surface for c in found.keyframes[-1].stance} == {"LFoot", "RFoot"}
+
+
+def test_it_turns_only_where_walls_leave_it_room(robot):
+    """A box of 2.4 m with a passage of 0.8 x 0.7 m in its middle, from x = 1.05 on."""
+    height, walls = 0.25, []
+    for name, y in (("left", 0.40), ("right", -0.40)):
+        wall = Box(
+            name=name,
+            size=np.array([0.8, 0.1, 0.5]),
+            position=np.array([1.45, y, height + 0.25]),
+            rotation=np.eye(3),
+        )
+        walls.append(wall)
+    open_ = scene(length=2.4, width=1.2, face=0.25, height=height)
+    walled = replace(open_, boxes=(*open_.boxes, *walls), goal=np.array([3.0, 0.0]))
+    task = module._task(IK(build_world(robot, walled)), POLICY, PlanOptions())
+    (platform,) = task.platforms
+
+    def heading(x, to, yaw=0.0):
+        here = module._Frame(np.array([x, 0.0]), yaw)
+        wanted = module._Frame(np.array([to, 0.0]), math.pi)
+        return module._heading(task, platform, here, wanted)
+
+    assert heading(0.5, 2.4).yaw == math.pi  # there is room at either end
+    between = heading(1.4, 2.4)
+    assert (between.yaw, between.xy[0]) == (0.0, 2.4)  # on, as it is
+    on_the_spot = heading(0.5, 1.7)
+    assert (on_the_spot.yaw, on_the_spot.xy[0]) == (math.pi, 0.5)
+    assert heading(1.4, 2.4, math.pi - 0.05).yaw == math.pi  # it faces there already
