@@ -85,10 +85,13 @@ def frame_from_normal(normal: ArrayLike, heading: ArrayLike) -> np.ndarray:
 
     Where the heading is parallel to the normal, x is any direction in the plane.
     """
-    zx, zy, zz = (float(c) for c in normal)
-    for x, y, z in (heading, np.eye(3)[np.argmin(np.abs((zx, zy, zz)))]):
-        along = x * zx + y * zy + z * zz
-        x, y, z = x - along * zx, y - along * zy, z - along * zz
+    # In plain floats: numpy takes several times as long for three numbers.
+    zx, zy, zz = np.asarray(normal, dtype=float).tolist()
+    axis = np.eye(3)[int(np.argmin(np.abs((zx, zy, zz))))].tolist()
+    x = y = z = n = 0.0
+    for hx, hy, hz in (np.asarray(heading, dtype=float).tolist(), axis):
+        along = hx * zx + hy * zy + hz * zz
+        x, y, z = hx - along * zx, hy - along * zy, hz - along * zz
         n = math.sqrt(x * x + y * y + z * z)
         if n >= 1e-9:
             break
