@@ -33,7 +33,7 @@ from clamber.view.page import FRAMES_A_SECOND
 from clamber.view.stage import LAYERS
 
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
-SETTLED = 6.0  # [s] until shaders are compiled and the resolution has been adapted
+SETTLED = 4.0  # [s] until shaders are compiled and the resolution has been adapted
 PORT = 8480
 # What has been drawn is looked at once for each frame of the browser: how often the
 # renderer has run, and whether the nodes under `root` are where they were.
