@@ -12,8 +12,7 @@ from playwright.sync_api import sync_playwright
 
 from clamber import open_view
 
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-         "--enable-unsafe-swiftshader"]  # fmt: skip
+FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 
 
 def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> None:

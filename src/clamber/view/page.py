@@ -30,10 +30,9 @@ ASPECT = 1.2  # of the picture beside the panel
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 SHEET = 0.17  # of the distance that what is seen is moved up, over a panel below
 GROUND, GROUND_SIZE, GROUND_CELL = "/ground", 8.0, 0.5  # [m]
-GROUND_LINE = 0.008  # [m]
-SECTIONS, CELLS = (150, 158, 168), (190, 196, 204)
-SUN = "/lights/sun"
-SUNLIGHT: dict[str, Any] = {"intensity": 2.2, "position": (-1.5, -2.5, 4.0)}
+GROUND_LINE = 0.005  # [m]
+SECTIONS, CELLS = (176, 183, 192), (208, 213, 220)
+DARK_SECTIONS, DARK_CELLS = (74, 80, 88), (46, 50, 56)
 PLAY, PAUSE = "play", "pause"
 BACK, ON = "< contact", "contact >"
 PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
@@ -201,16 +200,7 @@ class Page:
             ground_color=(170, 165, 160),
             intensity=2.2,
         )
-        scene.add_light_directional(SUN, cast_shadow=False, **SUNLIGHT)
-        vertices, faces = _ground_lines()
-        scene.add_mesh_simple(
-            GROUND,
-            vertices,
-            faces,
-            color=SECTIONS,
-            cast_shadow=False,
-            receive_shadow=False,
-        )
+        _surroundings(scene, dark=False, fine=False)
         gui.add_html(charts.STYLE)
         self.head = gui.add_html("")
         self._timeline()
@@ -272,10 +262,18 @@ class Page:
         @self._buttons.on_click
         def _(_: Any) -> None:
             pressed = self._buttons.value
-            if pressed == PLAY:
+            if pressed in (PLAY, PAUSE):
                 clock.toggle()
             else:
                 clock.step(1 if pressed == ON else -1)
+
+        for key, label, act in (
+            ("space", "Play or pause", clock.toggle),
+            ("pagedown", "Next contact", lambda: clock.step(1)),
+            ("pageup", "Previous contact", lambda: clock.step(-1)),
+        ):
+            command = gui.add_command(label, hotkey=cast(Any, key))
+            command.on_trigger(lambda _, act=act: act())
 
         @self._speed.on_update
         def _(_: Any) -> None:
@@ -301,22 +299,26 @@ class Page:
         client.gui.add_html(WISHES, order=1e9 + 2)
         if self._views and client.camera.image_width < client.camera.image_height:
             self.point(client, "corner")
-        light: list[Any] = []
+        own: list[Any] = []
+
+        def light() -> None:
+            """In this browser they stand in for those of all."""
+            while own:
+                own.pop().remove()
+            own.extend(_surroundings(client.scene, dark=dark.value, fine=fine.value))
 
         @dark.on_update
         def _(_: Any) -> None:
             client.gui.configure_theme(
                 dark_mode=dark.value, show_logo=False, show_share_button=False
             )
+            with self.clock.lock:
+                light()
 
         @fine.on_update
         def _(_: Any) -> None:
             with self.clock.lock:
-                if not fine.value:
-                    while light:
-                        light.pop().remove()
-                elif not light:
-                    light.extend(_shadows(client.scene))
+                light()
                 self._fine.pop(client.client_id, None)
                 if fine.value:
                     self._fine[client.client_id] = client
@@ -372,6 +374,7 @@ class Page:
                 tell(t)
             scale = "0.5" if self.clock.playing else "null"
             self._resolution.content = RESOLUTION.format(scale)
+            self._buttons.options = (BACK, PAUSE if self.clock.playing else PLAY, ON)
             if panel:
                 self._panel_next = now + PANEL_SECONDS
                 self._slider.value = round(t, 2)
@@ -389,24 +392,35 @@ class Page:
             last = now
 
 
-def _shadows(scene: viser.SceneApi) -> list[Any]:
-    """A sun that casts shadows, and a ground that has them.
-
-    In the browser whose scene it is they stand in for those of the same names.
-    """
-    sun = scene.add_light_directional(SUN, cast_shadow=True, **SUNLIGHT)
-    grid = scene.add_grid(
-        GROUND,
-        GROUND_SIZE,
-        GROUND_SIZE,
-        cell_size=GROUND_CELL / 5,
-        section_size=GROUND_CELL,
-        cell_color=CELLS,
-        section_color=SECTIONS,
-        fade_distance=9.0,
-        shadow_opacity=0.2,
+def _surroundings(scene: viser.SceneApi, *, dark: bool, fine: bool) -> list[Any]:
+    """Sun and ground; where it is fine, shadows too, and a ground that has them."""
+    sections, cells = (DARK_SECTIONS, DARK_CELLS) if dark else (SECTIONS, CELLS)
+    sun = scene.add_light_directional(
+        "/lights/sun", intensity=2.2, cast_shadow=fine, position=(-1.5, -2.5, 4.0)
     )
-    return [sun, grid]
+    if fine:
+        ground = scene.add_grid(
+            GROUND,
+            GROUND_SIZE,
+            GROUND_SIZE,
+            cell_size=GROUND_CELL / 5,
+            section_size=GROUND_CELL,
+            cell_color=cells,
+            section_color=sections,
+            fade_distance=9.0,
+            shadow_opacity=0.4 if dark else 0.2,
+        )
+    else:
+        vertices, faces = _ground_lines()
+        ground = scene.add_mesh_simple(
+            GROUND,
+            vertices,
+            faces,
+            color=sections,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+    return [sun, ground]
 
 
 def _ground_lines() -> tuple[np.ndarray, ...]:

@@ -11,7 +11,7 @@ Shapes: nb drawn bodies, nS surfaces, k contacts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +53,8 @@ SIDES = 16
 LINE = 0.006  # [m] width of lines
 STILL = 1e-5  # [m], of a quaternion: what moves by less is not sent
 MOST_CORNERS = 16  # of a support polygon that are drawn
-SEE_THROUGH = 0.6  # opacity of the robot around contacts and forces
+SEE_THROUGH = 0.45  # opacity of the robot around contacts and forces
+LINKS_AROUND = 3  # bodies from a contact upwards that its force may lie in
 HIDDEN = 1e-4  # scale of a part of a node that is not there
 RECORDING = "recording"
 LAYERS = {  # name in the page: shown at first
@@ -91,6 +92,7 @@ class Links:
         """
         self.root = server.scene.add_frame(root, show_axes=False)
         own = [m for m in meshes if m.body != 0]
+        self._bodies = [m.body for m in own]
         index = {m.body: i for i, m in enumerate(own)}
         self._rows = np.array([i for i, m in enumerate(meshes) if m.body != 0])
         names: list[str] = []
@@ -98,8 +100,8 @@ class Links:
         self._nodes: list[Any] = []
         self._names: list[str] = []
         self._meshes: list[list[Any]] = []
-        self._fine: dict[int, list[Any]] = {}  # of each browser that has them
-        self._opacity: float | None = None
+        self._fine: dict[int, list[list[Any]]] = {}  # of browsers that have them
+        self._clear: frozenset[int] = frozenset()
         for m in own:
             parent = int(world.model.body_parentid[m.body])
             while parent and parent not in index:
@@ -115,26 +117,31 @@ class Links:
         self._parents = np.array(parents, dtype=int)
         self._sent = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(own), 1))
 
-    def see_through(self, on: bool) -> None:
-        """Whether what is inside of them and behind is to be seen."""
-        self._opacity = SEE_THROUGH if on else None
-        for nodes in (*self._meshes, *self._fine.values()):
+    def see_through(self, bodies: Collection[int]) -> None:
+        """Have these let see what is inside of them and behind, and no others."""
+        self._clear = frozenset(bodies)
+        for meshes in (self._meshes, *self._fine.values()):
+            self._tint(meshes)
+
+    def _tint(self, meshes: Sequence[Sequence[Any]]) -> None:
+        for body, nodes in zip(self._bodies, meshes, strict=True):
             for node in nodes:
-                node.opacity = self._opacity
+                node.opacity = SEE_THROUGH if body in self._clear else None
 
     def refine(self, client: viser.ClientHandle, meshes: Sequence[Mesh]) -> None:
         """Have one browser draw other meshes of the same bodies, with shadows."""
-        nodes = self._fine[client.client_id] = []
         own = (m for m in meshes if m.body != 0)
-        for name, mesh in zip(self._names, own, strict=True):
-            nodes += add_mesh(client.scene, name, mesh, shadows=True)
-        for node in nodes:
-            node.opacity = self._opacity
+        fine = self._fine[client.client_id] = [
+            add_mesh(client.scene, name, mesh, shadows=True)
+            for name, mesh in zip(self._names, own, strict=True)
+        ]
+        self._tint(fine)
 
     def coarsen(self, client: viser.ClientHandle) -> None:
         """Have it draw the first ones again."""
-        for node in self._fine.pop(client.client_id, []):
-            node.remove()
+        for nodes in self._fine.pop(client.client_id, []):
+            for node in nodes:
+                node.remove()
 
     def pose(self, poses: np.ndarray, shown: np.ndarray | None = None) -> None:
         """Put the bodies where they are.
@@ -161,6 +168,14 @@ class Links:
             self._nodes[i].position = self._sent[i, :3] = moved[i]
         for i in np.flatnonzero(new[:, 3:].any(axis=1)):
             self._nodes[i].wxyz = self._sent[i, 3:] = turned[i]
+
+
+def _links_at(world: World, body: int) -> list[int]:
+    """A body and those above it up to the next that is drawn, that one included."""
+    links = [body]
+    while len(links) < LINKS_AROUND and world.model.body_parentid[links[-1]]:
+        links.append(int(world.model.body_parentid[links[-1]]))
+    return links
 
 
 def add_mesh(
@@ -405,7 +420,10 @@ class Stage:
             )
             self._ways.append(node)
         self._layers: dict[str, bool] = dict(LAYERS)
-        self._robot.see_through(LAYERS["see-through robot"])
+        self._links = {
+            name: frozenset(_links_at(world, surface.body))
+            for name, surface in world.surfaces.items()
+        }
 
     def fine(self, client: viser.ClientHandle, on: bool) -> None:
         """Whether a browser draws the robot with all its faces, and shadows."""
@@ -416,13 +434,12 @@ class Stage:
     def layer(self, name: str, shown: bool) -> None:
         """Show or hide one of `LAYERS`; what it holds follows with the next frame."""
         self._layers[name] = shown
-        if name == "see-through robot":
-            self._robot.see_through(shown)
 
     def show(self, frame: Frame) -> None:
         """Send what differs from the last frame."""
         on = self._layers
         self._robot.pose(frame.poses)
+        self._robot.see_through(self._clear(frame))
         if self._ghost is not None:
             self._ghost.root.visible = on["planned posture"]
             if frame.ghost is not None and on["planned posture"]:
@@ -440,6 +457,15 @@ class Stage:
         way = way_at(self._shown, frame.time) if on["way of the limb"] else None
         for node, its in zip(self._ways, self._shown.ways, strict=True):
             node.visible = its is way
+
+    def _clear(self, frame: Frame) -> frozenset[int]:
+        """Bodies that would hide what is shown: all, or those around the forces."""
+        if self._layers["see-through robot"]:
+            return frozenset(range(self._shown.world.model.nbody))
+        if not self._layers["forces"]:
+            return frozenset()
+        pushed = [x.surface for x in frame.touches if x.force is not None]
+        return frozenset().union(*(self._links[name] for name in pushed))
 
     def _show_forces(self, frame: Frame) -> None:
         arrows, colours = [], []
