@@ -223,12 +223,7 @@ def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as p:
         made = p.chromium.launch(
             executable_path=chromium,
-            args=[
-                "--no-sandbox",
-                "--use-gl=angle",
-                "--use-angle=swiftshader",
-                "--enable-unsafe-swiftshader",
-            ],
+            args=["--no-sandbox", "--enable-unsafe-swiftshader"],
         )
         yield made
         made.close()

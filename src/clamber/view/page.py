@@ -37,8 +37,8 @@ PLAY, PAUSE = "play", "pause"
 BACK, ON = "< contact", "contact >"
 PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
 DARK, FINE = "dark", "fine shapes"
-# What the browser wants is handed to the checkboxes: its own scheme; and shadows and all
-# faces, unless a processor draws, which would take longer for them than for all else.
+# What the browser wants is handed to the checkboxes: its own scheme; shadows and all
+# faces, unless a processor draws, which takes longer for them than for all the rest.
 WISHES = (
     '<img src="data:," style="display:none" onerror="'
     "const g=document.createElement('canvas').getContext('webgl2'),"

@@ -308,7 +308,8 @@ def apart(ghost: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """(nb,) whether bodies of the ghost can be told from those of the robot.
 
     Args:
-        ghost: (nb, 7) position [m] and unit quaternion; poses: the same of the robot.
+        ghost: (nb, 7) position [m] and unit quaternion.
+        poses: (nb, 7) the same of the robot.
     """
     turned = np.abs(np.sum(ghost[:, 3:] * poses[:, 3:], axis=1))
     off = np.linalg.norm(ghost[:, :3] - poses[:, :3], axis=1)

@@ -2,9 +2,9 @@
 
 Links hang in one another as the bodies do, so that a hinge that turns is one message,
 and one that does not is none. What has a changing number of parts (contacts, arrows,
-the polygon) is one node each. Where a processor draws, each node costs 0.2 ms a frame
-and each triangle 1.5 us: lines are rods with few faces, and a link of the ghost is there
-only where it can be told from the robot's own.
+the polygon) is one node each. Where a processor draws, a triangle costs some 2 us a
+frame: lines are rods with few faces, and a link of the ghost is there only where it can
+be told from the robot's own.
 
 Shapes: nb drawn bodies, nS surfaces, k contacts.
 """
@@ -28,9 +28,9 @@ from clamber.se3 import (
 )
 from clamber.view.person import Figure, Person
 from clamber.view.shown import (
+    ELLIPSE_POINTS,
     Frame,
     Shown,
-    ELLIPSE_POINTS,
     Touch,
     apart,
     beams,
@@ -111,9 +111,7 @@ class Links:
             names.append(f"{above}/{m.body}")
             self._nodes.append(server.scene.add_frame(names[-1], show_axes=False))
             self._names.append(f"{names[-1]}/mesh")
-            self._meshes.append(
-                add_mesh(server.scene, self._names[-1], m, ghost=ghost)
-            )
+            self._meshes.append(add_mesh(server.scene, self._names[-1], m, ghost=ghost))
         self._parents = np.array(parents, dtype=int)
         self._sent = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(own), 1))
 
