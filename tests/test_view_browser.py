@@ -172,7 +172,7 @@ def view(shared_page: Opened) -> Opened:
 
 
 def test_playing_moves_the_robot_as_physics_did(view: Opened):
-    """Until the pause, on the screen too; then each link is where the rollout has it."""
+    """Until the pause, on the screen too; each link is where the rollout has it."""
     clock, tab = view.page.clock, view.tab
     clock.go(0.3 * clock.end)
     tab.wait_for_timeout(600)
@@ -231,12 +231,14 @@ def test_a_click_on_a_stance_goes_there_and_marks_it(view: Opened):
     assert reached is not None
     view.tab.click("tbody[data-stance='2']")
     view.until(lambda: abs(view.page.clock.t - reached.keyframes[2]) < 0.01)
-    colours = [
-        "getComputedStyle(document.querySelector(\"tbody[data-stance='%d']\"))"
-        ".backgroundColor" % i
-        for i in (1, 2)
-    ]
-    view.until(lambda: view.tab.evaluate(colours[0]) != view.tab.evaluate(colours[1]))
+    colour = """i => getComputedStyle(document.querySelector(
+      `tbody[data-stance='${i}']`)).backgroundColor"""
+    view.until(
+        lambda: (
+            view.tab.evaluate(colour, 1) != view.tab.evaluate(colour, 2)
+            and view.tab.evaluate(colour, 0) == view.tab.evaluate(colour, 1)
+        )
+    )
 
 
 def test_a_click_in_a_plot_moves_time_and_all_cursors(view: Opened):
@@ -296,8 +298,9 @@ def test_shadows_and_all_faces_are_for_those_who_want_them(view: Opened):
     """No shadows where a processor draws, unless they are asked for."""
     shadows = """() => { let n = 0; window.__viserMutable.scene.traverse(
       x => n += x.isDirectionalLight && x.castShadow ? 1 : 0); return n }"""
-    faces = """name => { let n = 0; window.__viserMutable.nodeRefFromName[name].traverse(
-      x => n += x.isMesh ? x.geometry.index.count / 3 : 0); return n }"""
+    faces = """name => { let n = 0;
+      window.__viserMutable.nodeRefFromName[name].traverse(
+        x => n += x.isMesh ? x.geometry.index.count / 3 : 0); return n }"""
     assert view.tab.evaluate("window.clamberSoft")
     assert view.tab.evaluate(shadows) == 0
     few = view.tab.evaluate(faces, view.node("robot"))
@@ -339,7 +342,7 @@ def test_it_is_light_and_dark_as_the_browser_is_and_as_it_is_told(view: Opened):
 def test_a_contact_is_dragged_planned_simulated_and_saved(
     browser: Any, made: Path, tmp_path: Path
 ):
-    """With the mouse, on the arrow of the gizmo; what is beside the run folder stays."""
+    """With the mouse, on the arrow of the gizmo; what is beside the folder stays."""
     run = Path(shutil.copytree(made, tmp_path / "run"))
     before = {p.name: p.read_bytes() for p in run.iterdir()}
     with served(browser, run) as view:
@@ -387,7 +390,7 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
 
 
 def test_a_surface_that_is_switched_off_is_planned_without(view: Opened):
-    """The other hand alone; without both there is no plan, and undoing brings them back."""
+    """The other hand alone; without both there is no plan; undoing brings all back."""
     tab = view.tab
     view.show("Edit")
     view.switch("use RHand", False)
