@@ -21,7 +21,7 @@ from clamber.errors import InputError
 from clamber.view import charts
 from clamber.viz import PRESETS, Preset, View, frame_view
 
-FRAMES_A_SECOND = 40  # so that a browser that draws 30 has a new one for each
+FRAMES_A_SECOND = 45  # so that a browser that draws 30 has a new one for each
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")
 STEP = 0.02  # [s] events nearer than this are where one is
 PORTS = 50  # tried, one after the other
@@ -29,7 +29,7 @@ PANEL_WIDTH = 400  # [px]
 ASPECT = 1.2  # of the picture beside the panel
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 SHEET = 0.17  # of the distance that what is seen is moved up, over a panel below
-GROUND, GROUND_SIZE, GROUND_CELL = "/ground", 8.0, 0.5  # [m]
+GROUND, GROUND_SIZE, GROUND_CELL = "/ground", 8.0, 1.0  # [m]
 GROUND_LINE = 0.005  # [m]
 SECTIONS, CELLS = (176, 183, 192), (208, 213, 220)
 DARK_SECTIONS, DARK_CELLS = (74, 80, 88), (46, 50, 56)
@@ -403,8 +403,8 @@ def _surroundings(scene: viser.SceneApi, *, dark: bool, fine: bool) -> list[Any]
             GROUND,
             GROUND_SIZE,
             GROUND_SIZE,
-            cell_size=GROUND_CELL / 5,
-            section_size=GROUND_CELL,
+            cell_size=GROUND_CELL / 10,
+            section_size=GROUND_CELL / 2,
             cell_color=cells,
             section_color=sections,
             fade_distance=9.0,
