@@ -230,7 +230,8 @@ def test_a_click_on_a_stance_goes_there_and_marks_it(view: Opened):
     reached = clamber.load_plan(view.run).trajectory
     assert reached is not None
     view.tab.click("tbody[data-stance='2']")
-    view.until(lambda: abs(view.page.clock.t - reached.keyframes[2]) < 0.01)
+    clock = view.page.clock
+    view.until(lambda: abs(clock.t - reached.keyframes[2]) < 0.01, "the time")
     colour = """i => getComputedStyle(document.querySelector(
       `tbody[data-stance='${i}']`)).backgroundColor"""
     view.until(

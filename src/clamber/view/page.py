@@ -255,9 +255,12 @@ class Page:
 
         @self._slider.on_update
         def _(event: Any) -> None:
-            if event.client is not None:  # not our own
-                with clock.lock:
-                    clock.go(float(self._slider.value))
+            if event.client is None:  # our own
+                return
+            with clock.lock:
+                t = float(self._slider.value)
+                if t != round(clock.t, 2):  # nor what the browser says after us
+                    clock.go(t)
 
         @self._buttons.on_click
         def _(_: Any) -> None:
