@@ -28,6 +28,7 @@ from clamber.view.shown import frame_at, show_run
 from clamber.view.stage import LAYERS, RECORDING
 
 pytest.importorskip("viser")
+BROWSER_FLAGS: list[str] = []  # as Chromium draws by itself where there is no card
 WIDTH, HEIGHT = 900, 620
 # A node's matrix in the world of viser, of which z is up: three.js has y.
 MATRIX = """name => { const all = window.__viserMutable.nodeRefFromName;
