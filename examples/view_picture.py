@@ -8,12 +8,17 @@ from __future__ import annotations
 import shutil
 import sys
 
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
 from clamber import open_view
 
-FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-         "--enable-unsafe-swiftshader"]  # fmt: skip
+FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+
+
+def switch(tab: Page, label: str) -> None:
+    """Tick a checkbox of the panel."""
+    row = tab.locator("label", has_text=label).first.locator("xpath=../../..")
+    row.locator("input").check()
 
 
 def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> None:
@@ -32,10 +37,10 @@ def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> N
         tab.wait_for_selector("text=go to", state="attached")
         tab.add_style_tag(content=".mantine-Notification-root {display: none}")
         tab.wait_for_timeout(3000)
+        switch(tab, "fine shapes")  # shadows too: a processor may take its time here
         if width > 600:
             tab.get_by_role("tab", name="Show").click()
-            row = tab.locator("label", has_text="recording").locator("xpath=../../..")
-            row.locator("input").click()
+            switch(tab, "recording")
             tab.get_by_role("tab", name="Stances").click()
         tab.wait_for_timeout(1000)
         page.clock.go(0.68 * page.clock.end)

@@ -214,8 +214,9 @@ def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Headless Chromium with a software renderer."""
+def browser(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Headless Chromium with a software renderer; a module may name its flags."""
+    drawn = ["--use-gl=angle", "--use-angle=swiftshader"]  # all of it, as by a card
     chromium = shutil.which("chromium")
     playwright = pytest.importorskip("playwright.sync_api")
     if chromium is None:
@@ -225,9 +226,8 @@ def browser() -> Iterator[Any]:
             executable_path=chromium,
             args=[
                 "--no-sandbox",
-                "--use-gl=angle",
-                "--use-angle=swiftshader",
                 "--enable-unsafe-swiftshader",
+                *getattr(request.module, "BROWSER_FLAGS", drawn),
             ],
         )
         yield made

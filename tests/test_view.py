@@ -9,7 +9,6 @@ import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -335,99 +334,3 @@ def test_a_port_in_use_takes_the_next_one(whole: Path):
         page.close()
     assert page.host == "127.0.0.1"
     assert page.wanted == taken < page.port < taken + 50
-
-
-# In a browser.
-
-
-def opened(browser: Any, url: str, **options: Any) -> tuple[Any, list[str]]:
-    """The page in a small window, and its complaints; no other address answers."""
-    options = {"viewport": {"width": 760, "height": 480}, **options}
-    context = browser.new_context(**options)
-    tab, complaints = context.new_page(), []
-    tab.set_default_timeout(40_000)
-    tab.on("pageerror", lambda e: complaints.append(str(e)))
-    tab.on(
-        "console", lambda m: m.type == "error" and complaints.append(f"error: {m.text}")
-    )
-
-    def allow(route: Any) -> None:
-        if route.request.url.startswith((url, "blob:", "data:")):
-            route.continue_()
-        else:
-            complaints.append(route.request.url)
-            route.abort()
-
-    tab.route("**/*", allow)
-    tab.goto(url)
-    tab.wait_for_selector("text=go to", state="attached")
-    return tab, complaints
-
-
-def test_a_run_is_played_jumped_in_edited_and_saved(
-    browser: Any, whole: Path, tmp_path: Path
-):
-    """All by clicks but the drag: that goes through the gizmo's callback."""
-    pytest.importorskip("viser")
-    run = Path(shutil.copytree(whole, tmp_path / "run"))
-    before = {p.name for p in run.iterdir()}
-    page = open_view(run, port=18090)
-    try:
-        tab, complaints = opened(browser, page.url)
-        tab.click("tbody[data-stance='1']")
-        reached = clamber.load_plan(run).trajectory
-        assert reached is not None
-        until(tab, lambda: abs(page.clock.t - reached.keyframes[1]) < 0.01)
-        tab.click("text=< contact")
-        until(tab, lambda: page.clock.t < reached.keyframes[1] - 0.1)
-        t = page.clock.t
-        tab.click("button:has-text('play')")
-        until(tab, lambda: page.clock.t != t)
-        tab.get_by_role("tab", name="Edit").click()
-        row = tab.locator("label", has_text="move").first.locator("xpath=../../..")
-        row.locator("input").first.click()
-        tab.get_by_role("option", name="LHand on box, stance 1").click()
-        gizmo: Any = page.server.scene.get_handle_by_name("/edit/contact")
-        until(tab, lambda: gizmo.visible)
-        place = gizmo.position + np.array([0.04, 0.03, 0.0])
-        gizmo.position = place
-        for tell in gizmo._impl_aux.update_cb:
-            tell(SimpleNamespace(phase="end"))
-        tab.wait_for_selector("text=moved by 50 mm")
-        tab.click("button:has-text('Re-plan')")
-        tab.wait_for_selector("text=Planned to the last stance")
-        tab.get_by_role("button", name="Save", exact=True).click()
-        tab.wait_for_selector("text=Saved as")
-        hand = clamber.load_plan(run / "edited").keyframes[1].stance[-1]
-        assert hand.surface == "LHand"
-        np.testing.assert_allclose(hand.position[:2], place[:2], atol=0.005)
-        assert {p.name for p in run.iterdir()} - before == {"edited"}
-        assert complaints == []
-    finally:
-        page.close()
-
-
-def test_a_recording_is_shown_dark_and_on_a_phone(browser: Any):
-    pytest.importorskip("viser")
-    page = open_view("climb", port=18095)
-    try:
-        size = {"width": 390, "height": 780}
-        tab, complaints = opened(
-            browser, page.url, viewport=size, color_scheme="dark", has_touch=True
-        )
-        tab.wait_for_selector("[data-mantine-color-scheme=dark]", state="attached")
-        assert tab.evaluate("document.documentElement.scrollWidth") <= 390
-        tab.locator("tbody[data-stance='3']").dispatch_event("click")
-        start = clamber.detect_contacts(clamber.load_demo("climb")).t[3]
-        until(tab, lambda: abs(page.clock.t - start) < 0.01)
-        assert complaints == []
-    finally:
-        page.close()
-
-
-def until(tab: Any, met: Any) -> None:
-    for _ in range(600):
-        if met():
-            return
-        tab.wait_for_timeout(50)
-    pytest.fail("it never came")

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-SLICES, STACKS = 28, 8  # around a round geom, and over each half of it
+SLICES = 28  # around a round geom
 SHOWN_GROUPS = (0, 1, 2)  # of geoms, in MuJoCo's viewer
 MAX_TRIANGLES = 60_000  # of all mesh geoms together
 CREASE = math.radians(40.0)  # an edge that turns by more is sharp
@@ -52,13 +52,14 @@ _Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices, normals, tri
 
 
 def body_meshes(
-    model: mujoco.MjModel, *, max_triangles: int = MAX_TRIANGLES
+    model: mujoco.MjModel, *, max_triangles: int = MAX_TRIANGLES, slices: int = SLICES
 ) -> list[Mesh]:
     """The visible geoms of each body, tessellated; bodies that show nothing left out.
 
     Args:
         model: Compiled.
         max_triangles: More than these in mesh geoms are simplified.
+        slices: Faces around a round geom.
     """
     shown = np.flatnonzero(
         np.isin(model.geom_group, SHOWN_GROUPS)
@@ -73,7 +74,7 @@ def body_meshes(
     keep = min(1.0, max_triangles / max(faces, 1))
     by_body: dict[int, list[tuple[_Triangles, np.ndarray]]] = {}
     for g in shown:
-        part = geom_triangles(model, int(g), keep)
+        part = geom_triangles(model, int(g), keep, slices)
         if part is not None:
             colour = geom_colour(model, int(g))[:3]
             by_body.setdefault(int(model.geom_bodyid[g]), []).append((part, colour))
@@ -105,7 +106,7 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def geom_triangles(
-    model: mujoco.MjModel, geom: int, keep: float = 1.0
+    model: mujoco.MjModel, geom: int, keep: float = 1.0, slices: int = SLICES
 ) -> _Triangles | None:
     """Vertices, normals and triangles of a geom, in the frame of its body.
 
@@ -113,6 +114,7 @@ def geom_triangles(
         model: Compiled.
         geom: Its id.
         keep: Share of a mesh's triangles that may stay.
+        slices: Faces around a round geom.
 
     Returns:
         None for a kind that has no surface of its own (a plane, a height field).
@@ -122,15 +124,15 @@ def geom_triangles(
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         v, n, f = _box(size)
     elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        v, n, f = _revolved(_round(size[0], 0.0))
+        v, n, f = _revolved(_round(size[0], 0.0, slices), slices)
     elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        v, n, f = _revolved(_round(size[0], size[1]))
+        v, n, f = _revolved(_round(size[0], size[1], slices), slices)
     elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         r, h = size[0], size[1]
         rim = [(0, h, 0, 1), (r, h, 0, 1), (r, h, 1, 0), (r, -h, 1, 0), (r, -h, 0, -1)]
-        v, n, f = _revolved(np.array([*rim, (0, -h, 0, -1)], dtype=float))
+        v, n, f = _revolved(np.array([*rim, (0, -h, 0, -1)], dtype=float), slices)
     elif kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-        v, n, f = _revolved(_round(1.0, 0.0))
+        v, n, f = _revolved(_round(1.0, 0.0, slices), slices)
         v, n = v * size, n / size
         n = n / np.linalg.norm(n, axis=1, keepdims=True)
     elif data >= 0 and kind in (
@@ -146,25 +148,25 @@ def geom_triangles(
     return v @ R.T + model.geom_pos[geom], n @ R.T, f
 
 
-def _round(radius: float, half: float) -> np.ndarray:
+def _round(radius: float, half: float, slices: int) -> np.ndarray:
     """Profile of a ball, its halves `half` above and below the middle."""
-    a = np.linspace(math.pi / 2, 0.0, STACKS + 1)
+    a = np.linspace(math.pi / 2, 0.0, round(2 * slices / 7) + 1)
     up = np.stack(
         [radius * np.cos(a), radius * np.sin(a) + half, np.cos(a), np.sin(a)], axis=1
     )
     return np.concatenate([up, up[::-1] * [1.0, -1.0, 1.0, -1.0]])
 
 
-def _revolved(profile: np.ndarray) -> _Triangles:
+def _revolved(profile: np.ndarray, slices: int) -> _Triangles:
     """A profile (n, 4) of r, z and its normal from top to bottom, turned about z."""
-    a = np.linspace(0.0, 2 * math.pi, SLICES + 1)
-    c, s, one = np.cos(a), np.sin(a), np.ones(SLICES + 1)
+    a = np.linspace(0.0, 2 * math.pi, slices + 1)
+    c, s, one = np.cos(a), np.sin(a), np.ones(slices + 1)
     r, z, nr, nz = (x[:, None] for x in profile.T)
     v = np.stack([r * c, r * s, z * one], axis=-1).reshape(-1, 3)
     n = np.stack([nr * c, nr * s, nz * one], axis=-1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(len(profile) - 1), np.arange(SLICES), indexing="ij")
-    a0 = (i * (SLICES + 1) + j).ravel()
-    b0 = a0 + SLICES + 1
+    i, j = np.meshgrid(np.arange(len(profile) - 1), np.arange(slices), indexing="ij")
+    a0 = (i * (slices + 1) + j).ravel()
+    b0 = a0 + slices + 1
     f = np.concatenate(
         [np.stack([a0, b0, b0 + 1], axis=1), np.stack([a0, b0 + 1, a0 + 1], axis=1)]
     )

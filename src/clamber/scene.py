@@ -57,6 +57,7 @@ class Support:
     polygon: np.ndarray
     friction: float
     normal: np.ndarray = field(init=False)
+    _half_planes: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Copy the arrays and check that the polygon is convex, ccw."""
@@ -68,6 +69,12 @@ class Support:
         nxt = np.roll(edges, -1, axis=0)
         if np.any(edges[:, 0] * nxt[:, 1] - edges[:, 1] * nxt[:, 0] <= 0):
             raise ValueError(f"support {self.name}: polygon is not convex, ccw")
+        out = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        b = np.sum(out * self.polygon, axis=1)
+        A = out @ self.rotation[:, :2].T
+        planes = _frozen(A, (-1, 3)), _frozen(b + A @ self.position, (-1,))
+        object.__setattr__(self, "_half_planes", planes)
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (...,) of world points (..., 3) over the plane [m]."""
@@ -79,12 +86,7 @@ class Support:
 
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
         """Half-planes `A p <= b` of the polygon, A (K, 3) in the world, b (K,)."""
-        side = np.roll(self.polygon, -1, axis=0) - self.polygon
-        out = np.stack([side[:, 1], -side[:, 0]], axis=1)
-        out /= np.linalg.norm(out, axis=1, keepdims=True)
-        b = np.sum(out * self.polygon, axis=1)
-        A = out @ self.rotation[:, :2].T
-        return A, b + A @ self.position
+        return self._half_planes
 
     def inside(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Whether world points (..., 3) project at least `margin` inside [m]."""

@@ -94,6 +94,9 @@ STYLE = """<style>
 .clamber .key span { margin-right: 10px; white-space: nowrap; }
 .clamber .key i:not(.dot) { display: inline-block; width: 11px; height: 3px;
   margin-right: 4px; vertical-align: middle; }
+/* On a phone the panel is a sheet at the bottom: over all of the width, and lower. */
+@media (max-width: 36em) { [style*="width: 20em"] { width: 100% !important; }
+  .mantine-Paper-root[style*="width: 20em"] { max-height: 52% !important; } }
 </style>"""
 
 

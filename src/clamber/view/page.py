@@ -21,7 +21,7 @@ from clamber.errors import InputError
 from clamber.view import charts
 from clamber.viz import PRESETS, Preset, View, frame_view
 
-FRAMES_A_SECOND = 30
+FRAMES_A_SECOND = 45  # so that a browser that draws 30 has a new one for each
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")
 STEP = 0.02  # [s] events nearer than this are where one is
 PORTS = 50  # tried, one after the other
@@ -29,17 +29,39 @@ PANEL_WIDTH = 400  # [px]
 ASPECT = 1.2  # of the picture beside the panel
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 SHEET = 0.17  # of the distance that what is seen is moved up, over a panel below
-GROUND_SIZE = 12.0  # [m]
+GROUND, GROUND_SIZE, GROUND_CELL = "/ground", 8.0, 1.0  # [m]
+GROUND_LINE = 0.005  # [m]
+SECTIONS, CELLS = (176, 183, 192), (208, 213, 220)
+DARK_SECTIONS, DARK_CELLS = (74, 80, 88), (46, 50, 56)
 PLAY, PAUSE = "play", "pause"
 BACK, ON = "< contact", "contact >"
-DARK_FIRST = (  # follow the browser's own scheme: its wish is handed to the checkbox
+PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
+DARK, FINE = "dark", "fine shapes"
+# What the browser wants is handed to the checkboxes: its own scheme; shadows and all
+# faces, unless a processor draws, which takes longer for them than for all the rest.
+WISHES = (
     '<img src="data:," style="display:none" onerror="'
-    "if(matchMedia('(prefers-color-scheme: dark)').matches)"
-    "for(const l of document.querySelectorAll('label')){"
-    "if(l.textContent.trim()!=='dark')continue;"
+    "const g=document.createElement('canvas').getContext('webgl2'),"
+    "x=g&&g.getExtension('WEBGL_debug_renderer_info'),"
+    "n=g?g.getParameter(x?x.UNMASKED_RENDERER_WEBGL:g.RENDERER):'none',"
+    "lost=g&&g.getExtension('WEBGL_lose_context');"
+    "if(lost)lost.loseContext();"
+    "window.clamberSoft="
+    "/swiftshader|llvmpipe|softpipe|software|basic render|none/i.test(n);"
+    f"const wish={{'{DARK}':matchMedia('(prefers-color-scheme: dark)').matches,"
+    f"'{FINE}':!window.clamberSoft}};"
+    "for(const l of document.querySelectorAll('label'))"
+    "if(wish[l.textContent.trim()]){"
     "let e=l;while(!e.querySelector('input'))e=e.parentElement;"
-    "const i=e.querySelector('input');if(!i.checked)i.click();break}"
+    "const i=e.querySelector('input');if(!i.checked)i.click()}"
     '">'
+)
+# Where a processor draws, it draws a quarter of the pixels while time plays.
+RESOLUTION = (
+    '<img src="data:," style="display:none" onerror="'
+    "const v=window.__viserTestpoints;"
+    "if(window.clamberSoft&&v&&v.devSettings&&v.devSettings.set)"
+    'v.devSettings.set({{fixedDpr:{}}})">'
 )
 
 
@@ -126,6 +148,7 @@ class Clock:
             if not self.playing and self.t >= self.end:
                 self.go(self.begin)
             self.playing = not self.playing and self.end > self.begin
+            self.go(self.t)
 
     def advance(self, seconds: float) -> None:
         """Let so much time pass, where it plays."""
@@ -159,6 +182,10 @@ class Page:
         self.clock = Clock(self._tell)
         self._views: dict[Preset, View] = {}
         self._watchers: list[Callable[[float], None]] = []
+        self._panel_watchers: list[Callable[[float], None]] = []
+        self._panel_next = 0.0
+        self._refiners: list[Callable[[viser.ClientHandle, bool], None]] = []
+        self._fine: dict[int, viser.ClientHandle] = {}
         self._stopped = threading.Event()
         gui, scene = self.server.gui, self.server.scene
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -173,27 +200,13 @@ class Page:
             ground_color=(170, 165, 160),
             intensity=2.2,
         )
-        scene.add_light_directional(
-            "/lights/sun",
-            intensity=2.2,
-            cast_shadow=True,
-            position=(-1.5, -2.5, 4.0),
-        )
-        scene.add_grid(
-            "/ground",
-            GROUND_SIZE,
-            GROUND_SIZE,
-            cell_size=0.1,
-            section_size=0.5,
-            cell_color=(190, 196, 204),
-            section_color=(150, 158, 168),
-            fade_distance=9.0,
-            shadow_opacity=0.2,
-        )
+        _surroundings(scene, dark=False, fine=False)
         gui.add_html(charts.STYLE)
         self.head = gui.add_html("")
         self._timeline()
+        self._resolution = gui.add_html("", order=1e10)
         self.server.on_client_connect(self._welcome)
+        self.server.on_client_disconnect(self._forget)
         self._player = threading.Thread(target=self._play, daemon=True)
         self._player.start()
 
@@ -215,9 +228,12 @@ class Page:
         with silent():
             self.server.stop()
 
-    def watch(self, tell: Callable[[float], None]) -> None:
-        """Have it called with each new time [s]."""
-        self._watchers.append(tell)
+    def watch(self, tell: Callable[[float], None], *, panel: bool = False) -> None:
+        """Have it called with each new time [s]; with fewer where it is for the panel.
+
+        The panel is told of every time at which the clock stands still.
+        """
+        (self._panel_watchers if panel else self._watchers).append(tell)
 
     def look(self, view: Callable[[Preset], View]) -> None:
         """Where cameras begin from now on, and where the buttons take them."""
@@ -239,17 +255,28 @@ class Page:
 
         @self._slider.on_update
         def _(event: Any) -> None:
-            if event.client is not None:  # not our own
-                with clock.lock:
-                    clock.go(float(self._slider.value))
+            if event.client is None:  # our own
+                return
+            with clock.lock:
+                t = float(self._slider.value)
+                if t != round(clock.t, 2):  # nor what the browser says after us
+                    clock.go(t)
 
         @self._buttons.on_click
         def _(_: Any) -> None:
             pressed = self._buttons.value
-            if pressed == PLAY:
+            if pressed in (PLAY, PAUSE):
                 clock.toggle()
             else:
                 clock.step(1 if pressed == ON else -1)
+
+        for key, label, act in (
+            ("space", "Play or pause", clock.toggle),
+            ("pagedown", "Next contact", lambda: clock.step(1)),
+            ("pageup", "Previous contact", lambda: clock.step(-1)),
+        ):
+            command = gui.add_command(label, hotkey=cast(Any, key))
+            command.on_trigger(lambda _, act=act: act())
 
         @self._speed.on_update
         def _(_: Any) -> None:
@@ -269,17 +296,50 @@ class Page:
                 self._go_to.value = ""
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """What each browser has of its own: its theme."""
-        dark = client.gui.add_checkbox("dark", False, order=1e9)
-        client.gui.add_html(DARK_FIRST, order=1e9 + 1)
+        """What each browser has of its own: theme, shadows and faces."""
+        dark = client.gui.add_checkbox(DARK, False, order=1e9)
+        fine = client.gui.add_checkbox(FINE, False, order=1e9 + 1)
+        client.gui.add_html(WISHES, order=1e9 + 2)
         if self._views and client.camera.image_width < client.camera.image_height:
             self.point(client, "corner")
+        own: list[Any] = []
+
+        def light() -> None:
+            """In this browser they stand in for those of all."""
+            while own:
+                own.pop().remove()
+            own.extend(_surroundings(client.scene, dark=dark.value, fine=fine.value))
 
         @dark.on_update
         def _(_: Any) -> None:
             client.gui.configure_theme(
                 dark_mode=dark.value, show_logo=False, show_share_button=False
             )
+            with self.clock.lock:
+                light()
+
+        @fine.on_update
+        def _(_: Any) -> None:
+            with self.clock.lock:
+                light()
+                self._fine.pop(client.client_id, None)
+                if fine.value:
+                    self._fine[client.client_id] = client
+                for tell in self._refiners:
+                    tell(client, fine.value)
+
+    def _forget(self, client: viser.ClientHandle) -> None:
+        with self.clock.lock:
+            self._fine.pop(client.client_id, None)
+
+    @property
+    def fine(self) -> list[viser.ClientHandle]:
+        """Browsers that draw all faces."""
+        return list(self._fine.values())
+
+    def on_fine(self, tell: Callable[[viser.ClientHandle, bool], None]) -> None:
+        """Have it called when one of them begins or ceases to."""
+        self._refiners.append(tell)
 
     def add_cameras(self) -> None:
         """Buttons for the presets."""
@@ -309,10 +369,20 @@ class Page:
         self.clock.span(begin, end, events)
 
     def _tell(self, t: float) -> None:
+        """The scene follows each step of the clock, the panel some while it plays."""
+        now = time.perf_counter()
+        panel = not self.clock.playing or now >= self._panel_next
         with self.server.atomic():
-            self._slider.value = round(t, 2)
             for tell in self._watchers:
                 tell(t)
+            scale = "0.5" if self.clock.playing else "null"
+            self._resolution.content = RESOLUTION.format(scale)
+            self._buttons.options = (BACK, PAUSE if self.clock.playing else PLAY, ON)
+            if panel:
+                self._panel_next = now + PANEL_SECONDS
+                self._slider.value = round(t, 2)
+                for tell in self._panel_watchers:
+                    tell(t)
 
     def _play(self) -> None:
         """Let time pass, in steps of a frame, while somebody looks."""
@@ -323,6 +393,50 @@ class Page:
             if self.server.get_clients():
                 self.clock.advance(min(now - last, 0.25))
             last = now
+
+
+def _surroundings(scene: viser.SceneApi, *, dark: bool, fine: bool) -> list[Any]:
+    """Sun and ground; where it is fine, shadows too, and a ground that has them."""
+    sections, cells = (DARK_SECTIONS, DARK_CELLS) if dark else (SECTIONS, CELLS)
+    sun = scene.add_light_directional(
+        "/lights/sun", intensity=2.2, cast_shadow=fine, position=(-1.5, -2.5, 4.0)
+    )
+    if fine:
+        ground = scene.add_grid(
+            GROUND,
+            GROUND_SIZE,
+            GROUND_SIZE,
+            cell_size=GROUND_CELL / 10,
+            section_size=GROUND_CELL / 2,
+            cell_color=cells,
+            section_color=sections,
+            fade_distance=9.0,
+            shadow_opacity=0.4 if dark else 0.2,
+        )
+    else:
+        vertices, faces = _ground_lines()
+        ground = scene.add_mesh_simple(
+            GROUND,
+            vertices,
+            faces,
+            color=sections,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+    return [sun, ground]
+
+
+def _ground_lines() -> tuple[np.ndarray, ...]:
+    """Vertices and triangles of strips on the ground, both ways."""
+    half, wide = GROUND_SIZE / 2, GROUND_LINE / 2
+    at = np.arange(-half, half + 0.5 * GROUND_CELL, GROUND_CELL)
+    corners = [(-wide, -half), (wide, -half), (wide, half), (-wide, half)]
+    one, zero = np.ones_like(at), np.zeros_like(at)
+    strips = np.stack([[at + x, y * one, zero] for x, y in corners]).transpose(2, 0, 1)
+    across = strips[:, ::-1, [1, 0, 2]]
+    first = 4 * np.arange(2 * len(at))[:, None, None]
+    faces = first + np.array([[0, 1, 2], [0, 2, 3]])
+    return np.concatenate([strips, across]).reshape(-1, 3), faces.reshape(-1, 3)
 
 
 def eye_of(view: View) -> np.ndarray:

@@ -58,9 +58,12 @@ def recording_page(
 
     def show(t: float) -> None:
         stick.show(figure_at(person, t))
+
+    def show_figures(t: float) -> None:
         page.head.content = charts.recording_clock(person, t)
 
     page.watch(show)
+    page.watch(show_figures, panel=True)
     page.span(float(demo.t[0]), float(demo.t[-1]), change_times(person))
     return page
 

@@ -95,18 +95,24 @@ class _RunView:
         self._look()
         self._put(shown)
         self._panel(shown)
+        page.on_fine(lambda client, on: self._stage.fine(client, on))
         page.watch(self._show)
+        page.watch(self._show_figures, panel=True)
         page.span(0.0, shown.duration, shown.events())
 
     def _put(self, shown: Shown) -> None:
         """Make a stage for it, in place of the one before."""
         if self._count:
+            for client in self._page.fine:
+                self._stage.fine(client, False)
             self._stage.root.remove()
         self._count += 1
         self._shown, self._kin = shown, Kinematics(shown.world)
         self._stage = Stage(self._page.server, shown, f"/run{self._count}")
         for name, on in self._layers.items():
             self._stage.layer(name, on)
+        for client in self._page.fine:
+            self._stage.fine(client, True)
         self._times = person_times(shown)
 
     def _look(self) -> None:
@@ -120,15 +126,17 @@ class _RunView:
         self._page.look(views_of(points, float(world.scene.start[2]), fovy))
 
     def _show(self, t: float) -> None:
-        frame = frame_at(self._shown, self._kin, t)
-        self._stage.show(frame)
+        self._frame = frame_at(self._shown, self._kin, t)
+        self._stage.show(self._frame)
         if self._stick is not None and self._person is not None:
             on = self._layers[RECORDING]
             self._stick.root.visible = on
             if on:
                 at = float(np.interp(t, *self._times))
                 self._stick.show(figure_at(self._person, at))
-        self._page.head.content = charts.clock(self._shown, frame)
+
+    def _show_figures(self, _: float) -> None:
+        self._page.head.content = charts.clock(self._shown, self._frame)
 
     def _panel(self, shown: Shown) -> None:
         gui = self._page.server.gui

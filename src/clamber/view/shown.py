@@ -41,12 +41,14 @@ from clamber.view.edits import keyframe_steps
 from clamber.viz import FORCE_LENGTH, bearing_of, row_at, support_below
 
 PLAN_STRIDE = 10  # samples of a trajectory between two states that are shown
-ELLIPSE_POINTS = 48
-WAY_POINTS = 24  # of a limb's way
+ELLIPSE_POINTS = 32
+WAY_POINTS = 16  # of a limb's way
 AT_REST = 0.15  # [s] around a keyframe its forces are shown where physics has not run
 ARROW = 2 * FORCE_LENGTH  # [m] of the robot's weight: out of the limb it begins in
 PUSH_SCALE = 2.0  # arrows of pushes are so much longer than those of contact forces
 LEAST_FORCE = 0.005  # [weights] smaller forces are no arrow
+SLICES, MAX_TRIANGLES = 10, 6_000  # of shapes that a processor draws in time
+ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
 MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
 
 
@@ -127,7 +129,7 @@ class Shown:
     Attributes:
         plan: What was to be done; rollout: what physics made of it, or None.
         motion: For the plots.
-        meshes: (nb) drawn bodies.
+        meshes: (nb) drawn bodies; fine: the same with more faces.
         time: (M,) [s]; q: (M, nq); reference: (M, nq) or None.
         planned, loaded: (M, nS) bool.
         force: (M, nS, 3) [N], or None.
@@ -140,6 +142,7 @@ class Shown:
     rollout: Rollout | None
     motion: Motion
     meshes: tuple[Mesh, ...]
+    fine: tuple[Mesh, ...]
     time: np.ndarray
     q: np.ndarray
     reference: np.ndarray | None
@@ -204,7 +207,10 @@ def show_run(
         plan=plan,
         rollout=rollout,
         motion=motion,
-        meshes=tuple(body_meshes(world.model)),
+        meshes=tuple(
+            body_meshes(world.model, slices=SLICES, max_triangles=MAX_TRIANGLES)
+        ),
+        fine=tuple(body_meshes(world.model)),
         time=time,
         q=q,
         reference=reference,
@@ -296,6 +302,18 @@ def stance_at(shown: Shown, t: float) -> int:
         i for i, at in enumerate(shown.reached) if at is not None and at <= t + 1e-6
     ]
     return past[-1] if past else 0
+
+
+def apart(ghost: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(nb,) whether bodies of the ghost can be told from those of the robot.
+
+    Args:
+        ghost: (nb, 7) position [m] and unit quaternion.
+        poses: (nb, 7) the same of the robot.
+    """
+    turned = np.abs(np.sum(ghost[:, 3:] * poses[:, 3:], axis=1))
+    off = np.linalg.norm(ghost[:, :3] - poses[:, :3], axis=1)
+    return (off > ALIKE) | (2 * np.arccos(np.minimum(turned, 1.0)) > ALIKE_TURNED)
 
 
 def weight_of(world: World) -> float:
@@ -440,6 +458,32 @@ def tube(points: np.ndarray, radius: float, sides: int = 12) -> tuple[np.ndarray
         [np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)]
     )
     return np.concatenate(vertices), faces
+
+
+def beams(segments: np.ndarray, width: float) -> tuple[np.ndarray, ...]:
+    """Vertices (6 n, 3) and triangles (6 n, 3) of lines that are rods of three sides.
+
+    Their number is that of the segments, also of those without length.
+
+    Args:
+        segments: (n, 2, 3) their ends [m].
+        width: [m] of a side.
+    """
+    way = segments[:, 1] - segments[:, 0]
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    along = np.where(length > 1e-9, way / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
+    steep = np.abs(along[:, 2:]) > 0.9
+    side = np.cross(np.where(steep, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]), along)
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    up = np.cross(along, side)
+    turn = 2 * math.pi * np.arange(3) / 3 + math.pi / 2  # an edge on top
+    ring = np.stack([math.cos(a) * side + math.sin(a) * up for a in turn], axis=1)
+    ring *= width / math.sqrt(3)
+    vertices = np.concatenate([segments[:, :1] + ring, segments[:, 1:] + ring], axis=1)
+    i, j = np.arange(3), (np.arange(3) + 1) % 3
+    faces = np.concatenate([np.stack([i, j, j + 3], 1), np.stack([i, j + 3, i + 3], 1)])
+    start = 6 * np.arange(len(segments))[:, None, None]
+    return vertices.reshape(-1, 3), (faces + start).reshape(-1, 3)
 
 
 def person_times(shown: Shown) -> tuple[np.ndarray, np.ndarray]:

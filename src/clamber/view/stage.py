@@ -2,14 +2,16 @@
 
 Links hang in one another as the bodies do, so that a hinge that turns is one message,
 and one that does not is none. What has a changing number of parts (contacts, arrows,
-the polygon) is one node each.
+the polygon) is one node each. Where a processor draws, a triangle costs some 2 us a
+frame: lines are rods with few faces, and a link of the ghost is there only where it can
+be told from the robot's own.
 
 Shapes: nb drawn bodies, nS surfaces, k contacts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,20 +27,34 @@ from clamber.se3 import (
     quat_multiply,
 )
 from clamber.view.person import Figure, Person
-from clamber.view.shown import Frame, Shown, Touch, force_arrow, tube, way_at
+from clamber.view.shown import (
+    ELLIPSE_POINTS,
+    Frame,
+    Shown,
+    Touch,
+    apart,
+    beams,
+    force_arrow,
+    tube,
+    way_at,
+)
 from clamber.viz import PHASE_COLOURS
 
 GHOST = (59, 130, 246)
 PUSH = (162, 28, 175)
 BALANCE, ELLIPSE, COM = (37, 99, 235), (8, 145, 178), (217, 70, 239)
-WAY = (124, 58, 237)
+WAY, WAY_LINE, WAY_SIDES = (124, 58, 237), 0.004, 8  # radius of the line [m]
 PERSON, PERSON_BOX = (71, 105, 150), (203, 188, 165)
 BONE, JOINT, HEAD = 0.022, 0.03, 0.1  # [m] radii
 MOST_PARTS = 16  # of a person that are in contact at once
 DISC, DISC_HEIGHT, LIFT = 0.055, 0.004, 0.002  # [m]
 CONE_HEIGHT = 0.14  # [m]
-SIDES = 24
-SEE_THROUGH = 0.6  # opacity of the robot around contacts and forces
+SIDES = 16
+LINE = 0.006  # [m] width of lines
+STILL = 1e-5  # [m], of a quaternion: what moves by less is not sent
+MOST_CORNERS = 16  # of a support polygon that are drawn
+SEE_THROUGH = 0.45  # opacity of the robot around contacts and forces
+LINKS_AROUND = 3  # bodies from a contact upwards that its force may lie in
 HIDDEN = 1e-4  # scale of a part of a node that is not there
 RECORDING = "recording"
 LAYERS = {  # name in the page: shown at first
@@ -76,12 +92,16 @@ class Links:
         """
         self.root = server.scene.add_frame(root, show_axes=False)
         own = [m for m in meshes if m.body != 0]
+        self._bodies = [m.body for m in own]
         index = {m.body: i for i, m in enumerate(own)}
         self._rows = np.array([i for i, m in enumerate(meshes) if m.body != 0])
         names: list[str] = []
         parents: list[int] = []
         self._nodes: list[Any] = []
-        self._meshes: list[Any] = []
+        self._names: list[str] = []
+        self._meshes: list[list[Any]] = []
+        self._fine: dict[int, list[list[Any]]] = {}  # of browsers that have them
+        self._clear: frozenset[int] = frozenset()
         for m in own:
             parent = int(world.model.body_parentid[m.body])
             while parent and parent not in index:
@@ -90,48 +110,103 @@ class Links:
             above = names[parents[-1]] if parents[-1] >= 0 else root
             names.append(f"{above}/{m.body}")
             self._nodes.append(server.scene.add_frame(names[-1], show_axes=False))
-            self._meshes += add_mesh(server, f"{names[-1]}/mesh", m, ghost=ghost)
+            self._names.append(f"{names[-1]}/mesh")
+            self._meshes.append(add_mesh(server.scene, self._names[-1], m, ghost=ghost))
         self._parents = np.array(parents, dtype=int)
+        self._sent = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(own), 1))
 
-    def see_through(self, on: bool) -> None:
-        """Whether what is inside of them and behind is to be seen."""
-        for mesh in self._meshes:
-            mesh.opacity = SEE_THROUGH if on else None
+    def see_through(self, bodies: Collection[int]) -> None:
+        """Have these let see what is inside of them and behind, and no others."""
+        self._clear = frozenset(bodies)
+        for meshes in (self._meshes, *self._fine.values()):
+            self._tint(meshes)
 
-    def pose(self, poses: np.ndarray) -> None:
+    def _tint(self, meshes: Sequence[Sequence[Any]]) -> None:
+        for body, nodes in zip(self._bodies, meshes, strict=True):
+            for node in nodes:
+                node.opacity = SEE_THROUGH if body in self._clear else None
+
+    def refine(self, client: viser.ClientHandle, meshes: Sequence[Mesh]) -> None:
+        """Have one browser draw other meshes of the same bodies, with shadows."""
+        own = (m for m in meshes if m.body != 0)
+        fine = self._fine[client.client_id] = [
+            add_mesh(client.scene, name, mesh, shadows=True)
+            for name, mesh in zip(self._names, own, strict=True)
+        ]
+        self._tint(fine)
+
+    def coarsen(self, client: viser.ClientHandle) -> None:
+        """Have it draw the first ones again."""
+        for nodes in self._fine.pop(client.client_id, []):
+            for node in nodes:
+                node.remove()
+
+    def pose(self, poses: np.ndarray, shown: np.ndarray | None = None) -> None:
         """Put the bodies where they are.
 
         Args:
             poses: (nb, 7) in the world, of all meshes.
+            shown: (nb,) bool, which of them are to be seen; all by default.
         """
+        if shown is not None:
+            for meshes, on in zip(self._meshes, shown[self._rows], strict=True):
+                for mesh in meshes:
+                    mesh.visible = bool(on)
+            if not shown.any():
+                return
         p, q = poses[self._rows, :3], poses[self._rows, 3:]
         up = self._parents
         inverse = quat_conjugate(q[up])
         turned = quat_multiply(inverse, q)
         moved = np.einsum("nij,nj->ni", matrix_from_quat(inverse), p - p[up])
         turned[up < 0], moved[up < 0] = q[up < 0], p[up < 0]
-        for node, position, wxyz in zip(self._nodes, moved, turned, strict=True):
-            node.position, node.wxyz = position, wxyz
+        now = np.concatenate([moved, turned], axis=1)
+        new = np.abs(now - self._sent) > STILL
+        for i in np.flatnonzero(new[:, :3].any(axis=1)):
+            self._nodes[i].position = self._sent[i, :3] = moved[i]
+        for i in np.flatnonzero(new[:, 3:].any(axis=1)):
+            self._nodes[i].wxyz = self._sent[i, 3:] = turned[i]
+
+
+def _links_at(world: World, body: int) -> list[int]:
+    """A body and those above it up to the next that is drawn, that one included."""
+    links = [body]
+    while len(links) < LINKS_AROUND and world.model.body_parentid[links[-1]]:
+        links.append(int(world.model.body_parentid[links[-1]]))
+    return links
 
 
 def add_mesh(
-    server: viser.ViserServer, name: str, mesh: Mesh, *, ghost: bool = False
+    scene: viser.SceneApi,
+    name: str,
+    mesh: Mesh,
+    *,
+    ghost: bool = False,
+    shadows: bool = False,
 ) -> list[Any]:
-    """One node for each colour of a mesh."""
+    """One node for each colour of a mesh.
+
+    Args:
+        scene: Of all browsers, or of one.
+        name: Of the node that they hang in.
+        mesh: What to draw.
+        ghost: Pale and see-through.
+        shadows: It casts them, and has them on it.
+    """
     nodes = []
     corners = mesh.colours[mesh.triangles[:, 0]]
     colours, which = np.unique(corners.round(3), axis=0, return_inverse=True)
     for i, colour in enumerate(colours):
         faces = mesh.triangles[which.ravel() == i]
         used, at = np.unique(faces, return_inverse=True)
-        node = server.scene.add_mesh_simple(
+        node = scene.add_mesh_simple(
             f"{name}/{i}",
             mesh.vertices[used],
             at.reshape(-1, 3),
             color=GHOST if ghost else np.round(255 * colour).astype(np.uint8),
             opacity=0.28 if ghost else None,
-            cast_shadow=not ghost,
-            receive_shadow=not ghost,
+            cast_shadow=shadows,
+            receive_shadow=shadows,
         )
         nodes.append(node)
     return nodes
@@ -231,21 +306,23 @@ class Balance:
         """Send what has no shape yet."""
         add = server.scene
         self.root = add.add_frame(name, show_axes=False)
-        flat = np.zeros((3, 3))
+        fan = np.arange(1, MOST_CORNERS - 1)
         self._area = add.add_mesh_simple(
             f"{name}/area",
-            flat,
-            np.array([[0, 1, 2]]),
+            np.zeros((MOST_CORNERS, 3)),
+            np.stack([0 * fan, fan, fan + 1], axis=1),
             color=BALANCE,
             opacity=0.18,
             side="double",
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._lines = add.add_line_segments(
-            f"{name}/lines", np.zeros((1, 2, 3)), np.zeros((1, 2, 3)), thickness=0.006
+        self._rim = Lines(server, f"{name}/rim", MOST_CORNERS, BALANCE)
+        self._ring = Lines(server, f"{name}/ring", ELLIPSE_POINTS, ELLIPSE)
+        self._drop = Lines(server, f"{name}/drop", 1, COM)
+        self._com = add.add_icosphere(
+            f"{name}/com", radius=0.022, subdivisions=1, color=COM
         )
-        self._com = add.add_icosphere(f"{name}/com", radius=0.022, color=COM)
         vertices, faces = _cylinder(0.018, 0.003, 1.0)
         self._foot = add.add_mesh_simple(
             f"{name}/foot", vertices, faces, color=COM, cast_shadow=False
@@ -256,25 +333,34 @@ class Balance:
         lift = np.array([0.0, 0.0, LIFT])
         polygon, ellipse = frame.polygon.round(3), frame.ellipse.round(3)
         drop = np.stack([frame.foot, frame.com]).round(3)
-        rings = [(polygon, BALANCE), (ellipse, ELLIPSE)]
-        segments, colours = [drop[None]], [np.tile(COM, (1, 2, 1))]
-        for ring, colour in rings:
-            if len(ring) > 1:
-                ring = ring + 2 * lift
-                segments.append(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
-                colours.append(np.tile(colour, (len(ring), 2, 1)))
-        points, shades = np.concatenate(segments), np.concatenate(colours)
-        if len(points) != len(self._lines.points):
-            self._lines.colors = shades.astype(np.uint8)
-        self._lines.points = points
+        rows = np.minimum(np.arange(MOST_CORNERS), len(polygon) - 1)
         self._area.visible = len(polygon) > 2
         if len(polygon) > 2:
-            fan = np.arange(1, len(polygon) - 1)
-            faces = np.stack([0 * fan, fan, fan + 1], axis=1).astype(np.uint32)
-            if len(polygon) != len(self._area.vertices):
-                self._area.faces = faces
-            self._area.vertices = polygon + lift
+            self._area.vertices = polygon[rows] + lift
+        self._rim.show(polygon[rows] + 2 * lift if len(polygon) > 1 else polygon)
+        self._ring.show(ellipse + 2 * lift)
+        self._drop.show(drop)
         self._com.position, self._foot.position = drop[1], drop[0]
+
+
+class Lines:
+    """A ring of a fixed number of lines."""
+
+    def __init__(
+        self, server: viser.ViserServer, name: str, count: int, colour: Any
+    ) -> None:
+        """Send lines without length."""
+        vertices, faces = beams(np.zeros((count, 2, 3)), LINE)
+        self._node = server.scene.add_mesh_simple(
+            name, vertices, faces, color=colour, cast_shadow=False, receive_shadow=False
+        )
+
+    def show(self, ring: np.ndarray) -> None:
+        """Draw it through points (count, 3), or (2, 3) for one line; none hides it."""
+        self._node.visible = len(ring) > 1
+        if len(ring) > 1:
+            ends = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)
+            self._node.vertices = beams(ends[: len(ends) - (len(ends) == 2)], LINE)[0]
 
 
 class Stage:
@@ -293,7 +379,7 @@ class Stage:
         self.root = add.add_frame(root, show_axes=False)
         for m in shown.meshes:
             if m.body == 0:
-                add_mesh(server, f"{root}/scene", m)
+                add_mesh(add, f"{root}/scene", m, shadows=True)
         most = len(world.surfaces)
         self._robot = Links(server, f"{root}/robot", world, shown.meshes)
         self._ghost = None
@@ -314,7 +400,7 @@ class Stage:
         self._balance = Balance(server, f"{root}/balance")
         self._ways = []
         for i, way in enumerate(shown.ways):
-            vertices, faces = tube(way.points, way.radius)
+            vertices, faces = tube(way.points, way.radius, WAY_SIDES)
             name = f"{root}/way{i}"
             node = add.add_frame(name, show_axes=False, visible=False)
             add.add_mesh_simple(
@@ -326,26 +412,36 @@ class Stage:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            line = np.stack([way.points[:-1], way.points[1:]], axis=1)
-            add.add_line_segments(f"{name}/line", line, WAY, thickness=0.008)
+            line, sides = tube(way.points, WAY_LINE, 3)
+            add.add_mesh_simple(
+                f"{name}/line", line, sides, color=WAY, cast_shadow=False
+            )
             self._ways.append(node)
         self._layers: dict[str, bool] = dict(LAYERS)
-        self._robot.see_through(LAYERS["see-through robot"])
+        self._links = {
+            name: frozenset(_links_at(world, surface.body))
+            for name, surface in world.surfaces.items()
+        }
+
+    def fine(self, client: viser.ClientHandle, on: bool) -> None:
+        """Whether a browser draws the robot with all its faces, and shadows."""
+        self._robot.coarsen(client)
+        if on:
+            self._robot.refine(client, self._shown.fine)
 
     def layer(self, name: str, shown: bool) -> None:
         """Show or hide one of `LAYERS`; what it holds follows with the next frame."""
         self._layers[name] = shown
-        if name == "see-through robot":
-            self._robot.see_through(shown)
 
     def show(self, frame: Frame) -> None:
         """Send what differs from the last frame."""
         on = self._layers
         self._robot.pose(frame.poses)
+        self._robot.see_through(self._clear(frame))
         if self._ghost is not None:
             self._ghost.root.visible = on["planned posture"]
             if frame.ghost is not None and on["planned posture"]:
-                self._ghost.pose(frame.ghost)
+                self._ghost.pose(frame.ghost, apart(frame.ghost, frame.poses))
         self._discs.node.visible = on["contacts"]
         if on["contacts"]:
             self._discs.show(frame.touches)
@@ -359,6 +455,15 @@ class Stage:
         way = way_at(self._shown, frame.time) if on["way of the limb"] else None
         for node, its in zip(self._ways, self._shown.ways, strict=True):
             node.visible = its is way
+
+    def _clear(self, frame: Frame) -> frozenset[int]:
+        """Bodies that would hide what is shown: all, or those around the forces."""
+        if self._layers["see-through robot"]:
+            return frozenset(range(self._shown.world.model.nbody))
+        if not self._layers["forces"]:
+            return frozenset()
+        pushed = [x.surface for x in frame.touches if x.force is not None]
+        return frozenset().union(*(self._links[name] for name in pushed))
 
     def _show_forces(self, frame: Frame) -> None:
         arrows, colours = [], []
