@@ -26,6 +26,7 @@ from clamber.posture.ik import IK
 from clamber.posture.keyframe import contact_drift
 from clamber.scaling import retarget
 from clamber.scene import Scene
+from clamber.search import standing
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +151,44 @@ def test_a_demonstration_that_ends_where_it_began_asks_for_a_place(ik, goal, tri
     assert search(ik, back, tries=1).stop is Stop.TRIES  # not FOUND at once
     here = replace(goal, stances=(*goal.stances[:-1], goal.stances[0]))
     assert search(ik, here, tries=1).stop is Stop.FOUND
+
+
+def standing_on_box(goal, world):
+    """The sequence, ended on the feet alone, on the box."""
+    feet = [
+        replace(
+            c,
+            support="box",
+            position=c.position + np.array([0.5, 0.0, world.scene.boxes[0].size[2]]),
+        )
+        for c in goal.stances[0].contacts
+    ]
+    last = replace(goal.stances[-1], contacts=tuple(feet))
+    return replace(goal, stances=(*goal.stances[:-1], last)), feet
+
+
+@pytest.mark.parametrize("height", [1.0, 0.7])
+def test_to_stand_is_to_be_on_the_feet_alone_and_up(ik, goal, tried, height):
+    upright, feet = standing_on_box(goal, ik.world)
+    key = standing(ik, PlanOptions().keyframe)
+    states = tuple(
+        replace(s, contact=c) for s, c in zip(key.contacts, feet, strict=True)
+    )
+    q = key.q.copy()
+    q[2] = height * q[2] + feet[0].position[2]
+    ended = search(ik, upright, start=replace(key, contacts=states, q=q), tries=1)
+    assert (ended.stop is Stop.FOUND) is (height == 1.0)
+
+
+def test_kneeling_is_no_standing_and_arms_may_let_go(ik, goal, demo_plan, tried):
+    upright, _ = standing_on_box(goal, ik.world)
+    ended = search(ik, upright, start=demo_plan.keyframes[-1], tries=1000)
+    assert ended.stop is not Stop.FOUND
+    lets_go = {m.breaks for m in tried if m.makes is None}
+    assert lets_go == {("LElbow",), ("RElbow",)}
+    tried.clear()
+    search(ik, goal, start=demo_plan.keyframes[-2], tries=1000)
+    assert all(m.makes is not None for m in tried)  # who kneels needs them
 
 
 # Bounds.

@@ -32,6 +32,7 @@ LAYERS = [
     "disturbance",
     "truth",
     "sensing",
+    "leaning",
     "statics",
     "demo",
     "detect",

@@ -337,3 +337,16 @@ def test_a_box_that_is_not_there_is_no_crash_of_the_judge(start_only):
     nothing = Scene(start=np.zeros(3))
     rollout = simulate(start_only, controller="pid", truth=nothing)
     assert not judge(start_only, rollout).reached
+
+
+def test_who_ends_on_the_feet_alone_must_stand(demo_plan, demo_rollout):
+    name = "pelvis over its feet at the end, share of its first height"
+    on_feet = replace(demo_plan, keyframes=demo_plan.keyframes[:1])
+    home = demo_plan.world.home
+    for lower, stands in ((0.0, True), (0.1, True), (0.3, False)):
+        q = home.copy()
+        q[2] *= 1.0 - lower
+        c = judge(on_feet, with_last(demo_rollout, q)).criteria[name]
+        assert c.value == pytest.approx(1.0 - lower, abs=1e-6)
+        assert c.ok is stands
+    assert name not in judge(demo_plan, demo_rollout).criteria  # it ends kneeling

@@ -33,7 +33,12 @@ from clamber.path import Path
 from clamber.pipeline import PlanOptions, Progress
 from clamber.policy import GeneralPolicy
 from clamber.posture.ik import IK
-from clamber.posture.keyframe import Keyframe
+from clamber.posture.keyframe import (
+    STANDING_SHARE,
+    Keyframe,
+    on_feet,
+    standing_share,
+)
 from clamber.scaling import near_edge
 from clamber.scene import GROUND
 from clamber.se3 import quat_from_matrix
@@ -318,6 +323,7 @@ class _Guidance:
         goal = sequence.stances[-1].contacts
         limb_of = world.robot.limb_of
         self._goal = {limb_of(c.surface).name: c.support for c in goal}
+        self._stands = on_feet(world, goal)
         self._middle = np.mean([c.position[:2] for c in goal], axis=0)
         begin = {c.support for c in sequence.stances[0].contacts}
         self._leads_back = set(self._goal.values()) <= begin
@@ -340,9 +346,16 @@ class _Guidance:
         self._even = math.log(len(world.surfaces))  # what an action costs unguided
 
     def arrived(self, key: Keyframe) -> bool:
-        """Is every limb where the demonstration ends, and the pelvis at the goal?"""
+        """Is every limb where the demonstration ends, and the pelvis at the goal?
+
+        Where it ends on feet alone, the robot must stand, too.
+        """
         if self.left(key.stance) > 0:
             return False
+        if self._stands:
+            share = standing_share(self._world, key.stance, key.q)
+            if not on_feet(self._world, key.stance) or share < STANDING_SHARE:
+                return False
         if self._world.scene.goal is not None:
             off = key.q[:2] - self._world.scene.goal[:2]
             return float(np.linalg.norm(off)) <= GOAL_TOL
@@ -351,7 +364,11 @@ class _Guidance:
         return near or not self._leads_back
 
     def left(self, stance: Sequence[Contact]) -> float:
-        """What it will cost to get the limbs to the supports that they end on."""
+        """What it will cost to get the limbs to the supports that they end on.
+
+        To stand, a leg must be on its foot, and then the arms must let go: until both
+        feet are up they are help, and cost nothing.
+        """
         on = {self._world.robot.limb_of(c.surface).name: c for c in stance}
         ends = set(self._goal.values())
         total = 0.0
@@ -362,7 +379,7 @@ class _Guidance:
                 if c is None or c.support in ends:
                     continue
                 goal = min(ends)
-            elif c is not None and c.support == goal:
+            elif c is not None and c.support == goal and self._ends_on(c):
                 continue
             lengths = 1.0
             if c is not None:
@@ -370,7 +387,13 @@ class _Guidance:
                 length = max(self._length[s] for s in limb.surfaces)
                 lengths = float(np.linalg.norm(away)) / length
             total += 1.0 + FAR * lengths
+        if self._stands and total == 0.0:
+            total += sum(not on_feet(self._world, [c]) for c in stance)
         return total * self._even
+
+    def _ends_on(self, c: Contact) -> bool:
+        """Whether its surface may be the one that a limb ends on."""
+        return not self._stands or on_feet(self._world, [c])
 
     def actions(self, kin: Kinematics, state: _State) -> list[_Action]:
         """All that may be done in a state."""
@@ -382,6 +405,9 @@ class _Guidance:
             present = next((c for c in key.stance if c.surface in limb.surfaces), None)
             others = [c for c in key.stance if c is not present]
             root = kin.landmark(limb.root)[1].copy()
+            if self._stands and limb.is_arm and present is not None:
+                leaves = Move(limb=limb.name, breaks=(present.surface,), makes=None)
+                out.append(_Action(step=self._step(key, leaves), price=self._even))
             for surface in limb.surfaces:
                 for support in world.supports:
                     for c in self._contacts(surface, support, root):

@@ -18,6 +18,7 @@ from clamber.errors import InputError
 from clamber.execution import Event, Execution, Tracking
 from clamber.model import PHYSICS_STEP, World
 from clamber.pipeline import Plan
+from clamber.posture.keyframe import STANDING_SHARE, on_feet, standing_share
 from clamber.scene import GROUND, Scene
 from clamber.sensing import Sensors
 from clamber.trajectory import Trajectory
@@ -356,6 +357,10 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
         "deepest overlap with itself [m]": _at_most(rollout.self_overlap, OVERLAP_TOL),
         "largest effort, share of the limit": _at_most(effort, 1.0 + 1e-6),
     }
+    if on_feet(world, final):
+        goal["pelvis over its feet at the end, share of its first height"] = _at_least(
+            standing_share(rollout.world, final, last), STANDING_SHARE
+        )
     if world.scene.goal is None:
         goal["share of the weight at the end on obstacles"] = _at_least(on_boxes, 0.98)
         goal["pelvis above its support at the end [m]"] = _at_least(

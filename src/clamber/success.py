@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -88,7 +89,7 @@ def fit_break(level: ArrayLike, reached: ArrayLike) -> Break | None:
         centre = float(grid[flat].mean())
     else:
         a, b = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-        found = optimize.minimize_scalar(
+        found: Any = optimize.minimize_scalar(
             lambda c: -profile(float(c)), bounds=(a, b), method="bounded"
         )
         centre = float(found.x)

@@ -46,6 +46,7 @@ from clamber.statics import (
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
 CLEARANCE = 0.010  # [m] p_safe: between links, and between links and the scene
+STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
 HOLD_WEIGHT = 40.0  # of a new contact at a position that an outer method prescribes
 
 
@@ -364,6 +365,25 @@ def finish(
         cost_before=cost_before,
         cost_after=cost_after,
     )
+
+
+def on_feet(world: World, stance: Sequence[Contact]) -> bool:
+    """Whether a stance is one of feet alone: what ends so is meant to stand."""
+    limb_of = world.robot.limb_of
+    limbs = [(limb_of(c.surface), c.surface) for c in stance]
+    return bool(limbs) and all(
+        not limb.is_arm and surface == limb.surfaces[0] for limb, surface in limbs
+    )
+
+
+def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> float:
+    """Height of the pelvis over its supports, against that over the ground at first.
+
+    Over the nearest of them, along its normal. A robot on its feet alone stands from
+    `STANDING_SHARE` on; below, it squats.
+    """
+    over = [float(world.supports[c.support].height(q[:3])) for c in stance]
+    return min(over) / float(world.home[2])
 
 
 def contact_drift(kin: Kinematics, c: Contact) -> float:

@@ -24,6 +24,7 @@ from clamber.viz import PRESETS, Preset, View, frame_view
 FRAMES_A_SECOND = 45  # so that a browser that draws 30 has a new one for each
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")
 STEP = 0.02  # [s] events nearer than this are where one is
+SLIDER_STEP = 0.01  # [s]
 PORTS = 50  # tried, one after the other
 PANEL_WIDTH = 400  # [px]
 ASPECT = 1.2  # of the picture beside the panel
@@ -248,7 +249,7 @@ class Page:
     def _timeline(self) -> None:
         """Slider, buttons, speed, and the field that clicks in tables write into."""
         gui, clock = self.server.gui, self.clock
-        self._slider = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+        self._slider = gui.add_slider("time [s]", 0.0, 1.0, SLIDER_STEP, 0.0)
         self._buttons = gui.add_button_group("step", (BACK, PLAY, ON))
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1x")
         self._go_to = gui.add_text(charts.GO_TO, "")
@@ -259,7 +260,8 @@ class Page:
                 return
             with clock.lock:
                 t = float(self._slider.value)
-                if t != round(clock.t, 2):  # nor what the browser says after us
+                # Nor ours, which the browser says again, cut to its steps.
+                if abs(t - clock.t) >= 2 * SLIDER_STEP:
                     clock.go(t)
 
         @self._buttons.on_click
@@ -365,7 +367,7 @@ class Page:
 
     def span(self, begin: float, end: float, events: Sequence[float]) -> None:
         """What there is to play [s], and the times to step through."""
-        self._slider.min, self._slider.max = begin, max(end, begin + 0.01)
+        self._slider.min, self._slider.max = begin, max(end, begin + SLIDER_STEP)
         self.clock.span(begin, end, events)
 
     def _tell(self, t: float) -> None:

@@ -49,6 +49,7 @@ PUSH_SCALE = 2.0  # arrows of pushes are so much longer than those of contact fo
 LEAST_FORCE = 0.005  # [weights] smaller forces are no arrow
 SLICES, MAX_TRIANGLES = 10, 6_000  # of shapes that a processor draws in time
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
+STATES = 0.01  # [s] between two recorded states
 MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
 
 
@@ -297,9 +298,12 @@ def frame_at(shown: Shown, kin: Kinematics, t: float) -> Frame:
 
 
 def stance_at(shown: Shown, t: float) -> int:
-    """Index of the last keyframe that has been reached at a time [s]."""
+    """Index of the last keyframe that has been reached at a time [s].
+
+    To within two recorded states: the last one may be reached after the last of them.
+    """
     past = [
-        i for i, at in enumerate(shown.reached) if at is not None and at <= t + 1e-6
+        i for i, at in enumerate(shown.reached) if at is not None and at < t + STATES
     ]
     return past[-1] if past else 0
 
