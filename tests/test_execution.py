@@ -992,3 +992,16 @@ def test_a_contact_that_bears_nothing_is_felt_for_again(fast_plan, found):
     believed = pilot._believed().boxes[0].top
     assert abs(float(top.height(believed.position))) < 3e-3
     assert float(top.normal @ believed.normal) > np.cos(0.02)
+
+
+def test_a_limb_on_its_way_may_graze_an_edge(pilot):
+    """The others are kept farther away from what they lean on."""
+    m = pilot._world.model
+    made = pilot._legs[0].made
+    side = made.surface[0]
+    other = "R" if side == "L" else "L"
+    assert pilot._moves(m.geom(f"{side}UpperArm").id)
+    assert not pilot._moves(m.geom(f"{other}UpperArm").id)
+    assert not pilot._moves(m.geom(f"{side}Thigh").id)
+    pilot._leg = len(pilot._legs)
+    assert not pilot._moves(m.geom(f"{side}UpperArm").id)

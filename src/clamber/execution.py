@@ -547,7 +547,19 @@ class Execution:
             self._lean = leaning_part(self._kin, self._load, self._weight)
         else:
             self._lean = striking_part(self._kin, self._struck())
+        if self._lean is not None and self._moves(self._lean.geom):
+            self._lean = None
         return self._lean is not None
+
+    def _moves(self, geom: int) -> bool:
+        """Whether a geom is of the limb on its way: that grazes an edge and goes on."""
+        made = self._legs[self._leg].made if self._leg < len(self._legs) else None
+        if made is None:
+            return False
+        m, limb = self._world.model, self._plan.world.robot.limb_of(made.surface)
+        root = self._world.landmark(limb.root)[0]
+        body = self._world.surfaces[made.surface].body
+        return int(m.geom_bodyid[geom]) in chain_up(m, body, root)
 
     def _force(self, c: Contact) -> float:
         """Normal force on a surface [N]."""
