@@ -57,6 +57,7 @@ BLEND = 0.3  # [s] back to a trajectory that was left
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SAME_PLACE = 0.05  # [m] a surface that is felt again this near replaces what was felt
 LEANING = 0.1  # [s] a part bears for so long where it should not: it leans
+SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for what leans
 LEAN_STRIDE = 10  # physics steps between two looks at that
 KEPT_OFF = 0.02  # [m] farther than where it leant
 WITHDRAWALS = 4  # as often another way is looked for
@@ -142,6 +143,8 @@ class Execution:
         self._steps = () if by_policy else split_moves(plan.sequence, plan.world)[0]
         self._felt: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
         self._weight = 0.0  # [N] as felt
+        speed = plan.options.speed
+        self._slow = speed != "max" and speed <= SLOW
         self._leaning = 0.0  # [s] so long
         self._wary: dict[tuple[int, str], float] = {}
         self._lean: Lean | None = None
@@ -524,7 +527,7 @@ class Execution:
         q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
         q[3:7] /= np.linalg.norm(q[3:7])
 
-        if self._k % LEAN_STRIDE == 0:
+        if self._slow and self._k % LEAN_STRIDE == 0:
             lasts = is_leaning(self._load, self._weight) or len(self._struck()) > 0
             self._leaning += LEAN_STRIDE * PHYSICS_STEP if lasts else -self._leaning
 
