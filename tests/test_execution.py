@@ -255,7 +255,8 @@ def test_the_whole_climb_ends_on_top_of_a_lower_box(fast_plan, climbed):
     for key in pilot._keyframes:
         for c in key.stance:
             if c.support == "box":
-                assert c.position[2] == pytest.approx(TOP - 0.03, abs=5e-3)
+                # A contact that is off by less than that is taken as planned.
+                assert c.position[2] == pytest.approx(TOP - 0.03, abs=DEVIATION)
     assert rollout.qpos[-1, 2] == pytest.approx(
         fast_plan.trajectory.q[-1, 2] - 0.03, abs=0.02
     )
