@@ -112,9 +112,9 @@ def test_feeling_keeps_held_contacts_and_balance(demo_plan, step):
         assert max(contact_drift(kin, c) for c in held) < 5e-4
         polygon = support_polygon(bearing_frames(kin, held)[1][:, :2])
         assert com_margin(kin.com[:2], polygon) > 0.005
-        # Between postures at a limit the spline may pass it by a quarter of a degree.
-        assert np.all(x[world.qadr] >= world.q_min[world.dadr] - 4.4e-3)
-        assert np.all(x[world.qadr] <= world.q_max[world.dadr] + 4.4e-3)
+        # Between postures at a limit the spline may pass it by a fifth of a degree.
+        assert np.all(x[world.qadr] >= world.q_min[world.dadr] - 3.5e-3)
+        assert np.all(x[world.qadr] <= world.q_max[world.dadr] + 3.5e-3)
 
 
 @pytest.mark.parametrize("step", STEPS)

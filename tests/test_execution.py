@@ -257,6 +257,9 @@ def test_the_whole_climb_ends_on_top_of_a_lower_box(fast_plan, climbed):
             if c.support == "box":
                 # A contact that is off by less than that is taken as planned.
                 assert c.position[2] == pytest.approx(TOP - 0.03, abs=DEVIATION)
+    for c in pilot._keyframes[-1].stance:
+        there = point_at(rollout, rollout.time[-1], c.surface)
+        assert there[2] == pytest.approx(TOP - 0.03, abs=5e-3)
     assert rollout.qpos[-1, 2] == pytest.approx(
         fast_plan.trajectory.q[-1, 2] - 0.03, abs=0.02
     )

@@ -20,7 +20,6 @@ from clamber.errors import MissingDependency
 from clamber.model import Kinematics
 from clamber.pipeline import Plan
 from clamber.scene import Scene
-from clamber.simulation import Rollout
 from clamber.view import charts, edits, open_view
 from clamber.view.person import beside, figure_at, show_person
 from clamber.view.shown import (
@@ -35,16 +34,6 @@ from clamber.view.shown import (
 )
 
 NASTY = "<img src=x onerror=alert(1)>"
-
-
-@pytest.fixture(scope="module")
-def ran(one_hand_plan: Plan, one_hand_rollout: Rollout) -> Shown:
-    return show_run(one_hand_plan, one_hand_rollout)
-
-
-@pytest.fixture(scope="module")
-def planned(one_hand_plan: Plan) -> Shown:
-    return show_run(one_hand_plan, None)
 
 
 # What is shown at a time.

@@ -18,7 +18,6 @@ from clamber.contact import ContactSequence
 from clamber.model import Kinematics
 from clamber.motion import stance_rows
 from clamber.pipeline import Plan
-from clamber.simulation import Rollout
 from clamber.view import charts
 from clamber.view.charts import Line
 from clamber.view.person import Person, show_person
@@ -26,11 +25,6 @@ from clamber.view.shown import Shown, frame_at, show_run
 from clamber.viz import PHASE_COLOURS, frame_view
 
 TIME = np.linspace(0.0, 8.0, 801)
-
-
-@pytest.fixture(scope="module")
-def ran(one_hand_plan: Plan, one_hand_rollout: Rollout) -> Shown:
-    return show_run(one_hand_plan, one_hand_rollout)
 
 
 @pytest.fixture(scope="module")

@@ -45,16 +45,6 @@ from clamber.viz import bearing_of
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@pytest.fixture(scope="module")
-def ran(one_hand_plan: Plan, one_hand_rollout: Rollout) -> Shown:
-    return show_run(one_hand_plan, one_hand_rollout)
-
-
-@pytest.fixture(scope="module")
-def planned(one_hand_plan: Plan) -> Shown:
-    return show_run(one_hand_plan, None)
-
-
 def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Of a closed surface, positive where its faces look outwards."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))

@@ -8,20 +8,25 @@ was planned is a trajectory of its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 
 from clamber.contact import Contact
 from clamber.errors import InputError, Status
-from clamber.model import Kinematics, World, build_world, chain_up
+from clamber.model import Kinematics, World, build_world, limb_links
 from clamber.moves import Step, split_moves
 from clamber.path import ARC_WEIGHT, Path, Phase, bridge
 from clamber.pipeline import Midway, Plan, PlanOptions, search_steps, timed
 from clamber.posture import direct
-from clamber.posture.ik import IK, ContactGoal, support_rotation
+from clamber.posture.ik import (
+    IK,
+    NO_WARINESS,
+    ContactGoal,
+    Wary,
+    support_rotation,
+)
 from clamber.posture.keyframe import Keyframe, KeyframeTask, bearing_frames
 from clamber.scaling import retarget
 from clamber.scene import GROUND, Scene
@@ -37,7 +42,6 @@ FEELING_SPEED = 0.06  # [m/s] along the normal
 FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
 FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
-NOTHING: Mapping[tuple[int, str], float] = MappingProxyType({})
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
@@ -87,7 +91,7 @@ def adapt_plan(
     scene: Scene,
     now: Midway,
     commanded: np.ndarray,
-    wary: Mapping[tuple[int, str], float] = NOTHING,
+    wary: Wary = NO_WARINESS,
 ) -> Adapted:
     """Take a stance as it is and plan the steps that are left.
 
@@ -102,7 +106,7 @@ def adapt_plan(
     found = _adapt(plan, scene, now, commanded, wary)
     if found.missed and (wary or any(b.roughness > 0 for b in scene.boxes)):
         smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
-        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NOTHING)
+        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NO_WARINESS)
         if not other.missed or len(other.keyframes) > len(found.keyframes):
             return other
     return found
@@ -113,7 +117,7 @@ def _adapt(
     scene: Scene,
     now: Midway,
     commanded: np.ndarray,
-    wary: Mapping[tuple[int, str], float],
+    wary: Wary,
 ) -> Adapted:
     ik = IK(build_world(plan.world.robot, scene), wary)
     settled = settle(ik, now, commanded, plan.options)
@@ -267,6 +271,13 @@ def feeling(
     t = build_trajectory(world, [phase], speed=speed)
     a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
     cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
+    # Between two postures at a joint's limit the spline passes it by a little.
+    low, high = world.q_min[world.dadr], world.q_max[world.dadr]
+    q, v = cut["q"].copy(), cut["v"].copy()
+    inside = np.clip(q[:, world.qadr], low, high)
+    v[:, world.dadr] *= inside == q[:, world.qadr]
+    q[:, world.qadr] = inside
+    cut |= {"q": q, "v": v}
     return replace(t, time=t.time[: b - a], **cut)
 
 
@@ -326,10 +337,6 @@ def _limb_over(world: World, contact: Contact) -> np.ndarray:
 
     The other limbs stay where the support was found to be.
     """
-    m, limb = world.model, world.robot.limb_of(contact.surface)
-    root = world.landmark(limb.root)[0]
-    links = set()
-    for surface in limb.surfaces:
-        links.update(chain_up(m, world.surfaces[surface].body, root))
-    mine = np.isin(m.geom_bodyid[world.pairs], list(links)).any(axis=1)
+    links = list(limb_links(world, contact.surface))
+    mine = np.isin(world.model.geom_bodyid[world.pairs], links).any(axis=1)
     return mine & (world.pairs == world.support_geom[contact.support]).any(axis=1)

@@ -31,7 +31,7 @@ from clamber.adaptation import (
 from clamber.contact import Contact
 from clamber.control import JointLaw
 from clamber.leaning import Lean, is_leaning, leaning_part, strikes, striking_part
-from clamber.model import PHYSICS_STEP, Kinematics, World, chain_up
+from clamber.model import PHYSICS_STEP, Kinematics, World, chain_up, limb_links
 from clamber.moves import split_moves
 from clamber.pipeline import Midway, Plan
 from clamber.posture.keyframe import Keyframe
@@ -146,7 +146,7 @@ class Execution:
         speed = plan.options.speed
         self._slow = speed != "max" and speed <= SLOW
         self._leaning = 0.0  # [s] so long
-        self._wary: dict[tuple[int, str], float] = {}
+        self._wary: dict[tuple[int, str], float] = {}  # see `IK`
         self._lean: Lean | None = None
         self._withdrawals = 0
         self._scale = 1.0  # of the torques: mass as felt over mass as described
@@ -526,19 +526,27 @@ class Execution:
             q[3:7] *= -1
         q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
         q[3:7] /= np.linalg.norm(q[3:7])
-
         if self._slow and self._k % LEAN_STRIDE == 0:
-            lasts = is_leaning(self._load, self._weight) or len(self._struck()) > 0
-            self._leaning += LEAN_STRIDE * PHYSICS_STEP if lasts else -self._leaning
+            if is_leaning(self._load, self._weight) or self._struck():
+                self._leaning += LEAN_STRIDE * PHYSICS_STEP
+            else:
+                self._leaning = 0.0
 
     def _struck(self) -> list[str]:
         """Surfaces, neither in contact nor about to be, that strike a side."""
+        hit = [self._surfaces[i] for i in np.flatnonzero(strikes(self._load))]
+        if not hit:
+            return hit
         j = self._leg
         near = {c.surface for key in self._keyframes[j : j + 2] for c in key.stance}
-        if j < len(self._legs) and (made := self._legs[j].made) is not None:
-            near.update(self._plan.world.robot.limb_of(made.surface).surfaces)
-        hit = np.flatnonzero(strikes(self._load))
-        return [s for i in hit if (s := self._surfaces[i]) not in near]
+        made = self._next_made()
+        if made is not None:
+            near.update(self._world.robot.limb_of(made.surface).surfaces)
+        return [s for s in hit if s not in near]
+
+    def _next_made(self) -> Contact | None:
+        """The contact that the present step makes, if any."""
+        return self._legs[self._leg].made if self._leg < len(self._legs) else None
 
     def _leans(self) -> bool:
         """Whether something leans where it should not: then `_lean` says what."""
@@ -556,13 +564,9 @@ class Execution:
 
     def _moves(self, geom: int) -> bool:
         """Whether a geom is of the limb on its way: that grazes an edge and goes on."""
-        made = self._legs[self._leg].made if self._leg < len(self._legs) else None
-        if made is None:
-            return False
-        m, limb = self._world.model, self._plan.world.robot.limb_of(made.surface)
-        root = self._world.landmark(limb.root)[0]
-        body = self._world.surfaces[made.surface].body
-        return int(m.geom_bodyid[geom]) in chain_up(m, body, root)
+        made = self._next_made()
+        body = int(self._world.model.geom_bodyid[geom])
+        return made is not None and body in limb_links(self._world, made.surface)
 
     def _force(self, c: Contact) -> float:
         """Normal force on a surface [N]."""
@@ -736,8 +740,8 @@ def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
         if len(k) == 0:
             out.append(_Leg(ends[j], ends[j], ends[j + 1], ends[j + 1], None))
             continue
-        air = ends[j] + int(k[0]), ends[j] + int(k[-1])
-        out.append(_Leg(ends[j], *air, ends[j + 1], c))
+        swing, touch = ends[j] + int(k[0]), ends[j] + int(k[-1])
+        out.append(_Leg(ends[j], swing, touch, ends[j + 1], c))
     return out
 
 

@@ -716,6 +716,16 @@ def chain_up(model: mujoco.MjModel, body: int, top: int = 0) -> list[int]:
     return chain
 
 
+def limb_links(world: World, surface: str) -> set[int]:
+    """Bodies of the limb of a surface, from below its root to its surfaces."""
+    limb = world.robot.limb_of(surface)
+    root = world.landmark(limb.root)[0]
+    out = set()
+    for s in limb.surfaces:
+        out.update(chain_up(world.model, world.surfaces[s].body, root))
+    return out
+
+
 def _leg_joints(
     model: mujoco.MjModel, robot: Robot, surfaces: Mapping[str, Surface]
 ) -> list[int]:

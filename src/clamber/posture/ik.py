@@ -54,9 +54,12 @@ BALANCE_TOL = 2e-3  # [m]
 FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
 ROUGHNESS_WEIGHT = 10.0  # soft task: more distance from what is rough
-EDGE_ROOM = 0.045  # [m] ... and should be, where it costs nothing else
-EDGE_WEIGHT = 3.0
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
+EDGE_ROOM = 0.045  # [m] ... and round ones should, where it costs nothing else
+EDGE_WEIGHT = 3.0
+# How much farther than its clearance a part stays from a support [m], by geom and name.
+Wary = Mapping[tuple[int, str], float]
+NO_WARINESS: Wary = MappingProxyType({})
 SOFT = 8  # daqp's type of a constraint that may give way
 
 
@@ -287,15 +290,12 @@ class QP:
 class IK:
     """Workspace of the solver: one per world, used again for every posture."""
 
-    def __init__(
-        self, world: World, wary: Mapping[tuple[int, str], float] = MappingProxyType({})
-    ) -> None:
+    def __init__(self, world: World, wary: Wary = NO_WARINESS) -> None:
         """Allocate rows once.
 
         Args:
             world: Robot and scene.
-            wary: How much farther than its clearance a part stays from a support [m],
-                by geom and name of the support: as a task, like the roughness of a box.
+            wary: As a task, like the roughness of a box.
         """
         self.world = world
         self.kin = Kinematics(world)

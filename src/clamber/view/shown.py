@@ -16,7 +16,7 @@ import numpy as np
 
 from clamber.io import keyframe_fields
 from clamber.meshes import Mesh, body_meshes, body_poses
-from clamber.model import Kinematics, World
+from clamber.model import PHYSICS_STEP, Kinematics, World
 from clamber.motion import (
     Motion,
     keyframe_times,
@@ -26,7 +26,7 @@ from clamber.motion import (
 )
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import CLEARANCE
-from clamber.simulation import Rollout
+from clamber.simulation import STRIDE, Rollout
 from clamber.statics import (
     GRAVITY,
     Phase,
@@ -49,7 +49,7 @@ PUSH_SCALE = 2.0  # arrows of pushes are so much longer than those of contact fo
 LEAST_FORCE = 0.005  # [weights] smaller forces are no arrow
 SLICES, MAX_TRIANGLES = 10, 6_000  # of shapes that a processor draws in time
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
-STATES = 0.01  # [s] between two recorded states
+STATES = STRIDE * PHYSICS_STEP  # [s] between two recorded states
 MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
 
 
