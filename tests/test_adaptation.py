@@ -22,6 +22,7 @@ from clamber.errors import Status
 from clamber.model import Kinematics, World, build_world
 from clamber.moves import split_moves
 from clamber.pipeline import Midway
+from clamber.posture.ik import IK
 from clamber.posture.keyframe import bearing_frames, contact_drift
 from clamber.se3 import matrix_from_rpy
 from clamber.statics import com_margin, support_polygon
@@ -441,3 +442,18 @@ def test_only_the_first_move_of_a_limb_is_another(demo_plan):
     # A limb that is in the air breaks nothing, whatever is below it.
     (air,) = from_here([hand[0]], other, world)
     assert hand[0].move.breaks == air.move.breaks == ()
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_where_one_margin_does_not_reach_the_next_goes_on(demo_plan, step):
+    made, held, q = made_at(demo_plan, step)
+    ik = IK(demo_plan.world)
+    free = np.zeros(len(demo_plan.world.pairs), dtype=bool)
+
+    def below(*margins):
+        return adaptation._nodes_below(ik, held, made, q, free, margins)[1]
+
+    assert below(0.5) == [0.0]  # no stance has that margin
+    assert below(0.5, 0.01) == below(0.01)
+    assert below(0.01)[-1] > 0.0
+    assert below(0.045, 0.01)[-1] >= below(0.01)[-1]

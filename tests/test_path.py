@@ -322,3 +322,13 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
             if np.linalg.norm(knee - made.position) > 0.02:  # not yet touching down
                 assert distance > CLEARANCE - 1e-3
     assert min(entered) < -5e-3  # the right knee: 21 mm into the box
+
+
+def test_where_little_moves_a_bridge_has_no_postures_between(demo_plan, ik):
+    t = demo_plan.paths[0].transition
+    small = np.zeros(ik.world.model.nv)
+    small[ik.world.dadr[0]] = 0.01
+    near = ik.kin.integrate(t.before, small)
+    assert len(path_module.bridge(ik, t.before, near, t.held, t.held)) == 2
+    far = max(p.phases[0].q.shape[0] for p in demo_plan.paths)
+    assert far > 2

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError
-from clamber.route import BESIDE, BORDER, find_place, find_platforms, goal_of
+from clamber.route import (
+    BESIDE,
+    BORDER,
+    find_place,
+    find_platforms,
+    goal_of,
+    room_on,
+)
 from clamber.scene import Box, Scene
 from clamber.se3 import matrix_from_rpy
 
@@ -99,3 +106,21 @@ def test_a_goal_off_the_ground_is_refused_and_a_missing_one_is_the_first_top():
     )
     with pytest.raises(InputError, match="a goal, or a box"):
         goal_of(Scene(start=np.zeros(3)))
+
+
+def test_a_gap_of_exactly_what_is_crawled_across_is_crawled_across():
+    """0.30 m, which no sum of lengths is to the last bit."""
+    boxes = scene(box("a", 0.6), box("b", 1.5), goal=(4.0, 0.0))
+    assert len(find_platforms(boxes, np.array([4.0, 0.0]))) == 1
+
+
+def test_the_room_on_a_box_is_that_to_the_nearest_other_box():
+    left = box("left", 0.6, (0.4, 0.1, 0.5), y=0.40, below=0.25)
+    right = box("right", 0.6, (0.4, 0.1, 0.5), y=-0.45, below=0.25)
+    walled = scene(box("table", 0.6, (2.0, 1.2, 0.25)), left, right)
+    assert room_on(walled, ("table",), np.array([0.6, 0.0])) == pytest.approx(0.35)
+    corner = np.hypot(0.3, 0.35)
+    assert room_on(walled, ("table",), np.array([1.1, 0.0])) == pytest.approx(corner)
+    assert room_on(walled, ("table",), np.array([0.6, 0.42])) == 0.0
+    alone = scene(box("table", 0.6))
+    assert room_on(alone, ("table",), np.array([0.6, 0.0])) == np.inf

@@ -17,6 +17,7 @@ from clamber.statics import (
     GRAVITY,
     TorqueLimits,
     com_margin,
+    com_margins,
     cone_generators,
     contact_angle,
     contact_forces,
@@ -826,3 +827,26 @@ def test_the_quick_test_fits_a_planners_inner_loop():
         is_statically_stable(*stance)
         took.append(time.perf_counter() - start)
     assert np.median(took) < 600e-6
+
+
+@pytest.mark.parametrize("polygon", [SQUARE, SQUARE[:3], SQUARE[:2], SQUARE[:1]])
+def test_margins_of_many_are_those_of_each(polygon):
+    com = np.random.default_rng(3).uniform(-0.3, 0.3, (200, 2))
+    each = [com_margin(c, polygon) for c in com]
+    np.testing.assert_allclose(com_margins(com, polygon), each, atol=1e-12)
+
+
+def test_a_limit_is_named_though_its_lp_has_a_weight():
+    """Four feet of a table: the two that its weight leaves first."""
+    points = np.array([[x, y, 0.0] for x in (0.1, -0.1) for y in (0.2, -0.2)])
+    verdict = static_equilibrium(
+        points,
+        np.tile([0.0, 0.0, 1.0], (4, 1)),
+        np.full(4, 0.8),
+        np.array([0.0, 0.0, 0.5]),
+        10.0,
+        names=["a", "b", "c", "d"],
+    )
+    # It tips over two feet when the push at 0.5 m is 0.1 / 0.5 of the weight.
+    assert verdict.margin == pytest.approx(0.2, abs=1e-6)
+    assert verdict.limiting in {"a", "b", "c", "d"}

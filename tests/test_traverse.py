@@ -16,9 +16,11 @@ from clamber.io import load_plan, save_plan
 from clamber.model import Kinematics, build_world, load_robot
 from clamber.pipeline import Plan, PlanOptions
 from clamber.policy import GeneralPolicy, Option, PelvisDistribution
+from clamber.posture import direct
 from clamber.posture.ik import IK
-from clamber.posture.keyframe import contact_drift
+from clamber.posture.keyframe import KeyframeTask, contact_drift
 from clamber.scene import GROUND, Box, Scene
+from clamber.search import standing
 from clamber.traverse import cost_to_go, follow_policy, plan_traverse
 
 
@@ -359,3 +361,77 @@ def test_a_plan_with_its_policy_survives_disk(crossing, tmp_path):
     assert again.policy is not None
     assert again.policy.options == POLICY.options
     assert again.iterations == crossing.iterations
+
+
+def test_cycles_without_getting_nearer_are_given_up(robot, monkeypatch):
+    world = build_world(robot, scene())
+    ik = IK(world)
+    key = standing(ik, PlanOptions().keyframe)
+    idle = lambda task, key: ([(key, None, "ac3")], "")  # noqa: E731
+    monkeypatch.setattr(module, "_manoeuvre", idle)
+    found = follow_policy(ik, POLICY, key, PlanOptions(), changes=1000)
+    assert "no nearer to the goal" in found.missed
+    assert not found.arrived
+    assert len(found.paths) == module.PATIENCE + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["LKnee", "RElbow"])
+def test_a_limb_that_lost_its_contact_is_set_down_first(crossing, lost):
+    ik = IK(crossing.world)
+    middle = next(
+        k
+        for k in crossing.keyframes
+        if all(c.support == "table" for c in k.stance) and len(k.stance) == 4
+    )
+    held = tuple(c for c in middle.stance if c.surface != lost)
+    task = KeyframeTask(held=held, new=(), q_reference=middle.q)
+    key = direct.optimise(ik, task, middle.q, PlanOptions().keyframe)
+    found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
+    assert not found.missed
+    move = found.paths[0].transition.move
+    assert move.makes.surface == lost
+    assert move.breaks == ()
+    assert len(found.keyframes[-1].stance) == 4
+
+
+@pytest.mark.slow
+def test_a_foot_that_lost_the_ground_is_set_down(robot):
+    bare = Scene(start=np.zeros(3), goal=np.array([0.3, 0.0]))
+    ik = IK(build_world(robot, bare))
+    both = standing(ik, PlanOptions().keyframe)
+    left = tuple(c for c in both.stance if c.surface == "LFoot")
+    task = KeyframeTask(held=left, new=(), q_reference=both.q)
+    key = direct.optimise(ik, task, both.q, PlanOptions().keyframe)
+    found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
+    assert not found.missed
+    assert {c.surface for c in found.keyframes[-1].stance} == {"LFoot", "RFoot"}
+
+
+def test_it_turns_only_where_walls_leave_it_room(robot):
+    """A box of 2.4 m with a passage of 0.8 x 0.7 m in its middle, from x = 1.05 on."""
+    height, walls = 0.25, []
+    for name, y in (("left", 0.40), ("right", -0.40)):
+        wall = Box(
+            name=name,
+            size=np.array([0.8, 0.1, 0.5]),
+            position=np.array([1.45, y, height + 0.25]),
+            rotation=np.eye(3),
+        )
+        walls.append(wall)
+    open_ = scene(length=2.4, width=1.2, face=0.25, height=height)
+    walled = replace(open_, boxes=(*open_.boxes, *walls), goal=np.array([3.0, 0.0]))
+    task = module._task(IK(build_world(robot, walled)), POLICY, PlanOptions())
+    (platform,) = task.platforms
+
+    def heading(x, to, yaw=0.0):
+        here = module._Frame(np.array([x, 0.0]), yaw)
+        wanted = module._Frame(np.array([to, 0.0]), math.pi)
+        return module._heading(task, platform, here, wanted)
+
+    assert heading(0.5, 2.4).yaw == math.pi  # there is room at either end
+    between = heading(1.4, 2.4)
+    assert (between.yaw, between.xy[0]) == (0.0, 2.4)  # on, as it is
+    on_the_spot = heading(0.5, 1.7)
+    assert (on_the_spot.yaw, on_the_spot.xy[0]) == (math.pi, 0.5)
+    assert heading(1.4, 2.4, math.pi - 0.05).yaw == math.pi  # it faces there already

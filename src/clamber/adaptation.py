@@ -250,13 +250,10 @@ def feeling(
     room = com_margin(ik.kin.com[:2], support_polygon(points))
     if room <= 0:
         return None
-    # At first the robot must not lean after the contact; where it has to, it may.
     low, high = FEELING_MARGIN
-    for margin in (float(np.clip(room, low, high)), low):
-        nodes, depths = _nodes_below(ik, held, contact, q, free, margin)
-        if len(nodes) > 1:
-            break
-    else:
+    margins = (float(np.clip(room, low, high)), low)
+    nodes, depths = _nodes_below(ik, held, contact, q, free, margins)
+    if len(nodes) == 1:
         return None
     phase = Phase(
         kind="swing",
@@ -287,49 +284,74 @@ def _nodes_below(
     contact: Contact,
     q: np.ndarray,
     free: np.ndarray,
-    margin: float,
+    margins: tuple[float, ...],
 ) -> tuple[list[np.ndarray], list[float]]:
-    """Postures from `q` on, and how deep the contact is in each, as far as it goes."""
-    world = ik.world
-    support = world.supports[contact.support]
+    """Postures from `q` on, and how deep the contact is in each, as far as it goes.
+
+    The centre of mass keeps the first of `margins`: the robot must not lean after the
+    contact. Where a depth is not reached so, it may, to the next of them.
+    """
+    support = ik.world.supports[contact.support]
     # Straight down from where the limb is: a round surface has rolled since its plan.
     ik.kin.update(q)
     p = ik.kin.contact_point(contact.surface, support.normal)
     top = p - support.normal * float((p - contact.position) @ support.normal)
     nodes, depths = [q], [0.0]
     for depth in FEELING_DEPTHS:
-        goal = ContactGoal(
-            surface=contact.surface,
-            support=contact.support,
-            position=top - depth * support.normal,
-            rotation=support_rotation(support, contact.quaternion),
-            hard=False,
-            reference=ARC_WEIGHT,
-        )
-        problem = balance_problem(
-            world,
-            held=held,
-            q_reference=nodes[-1],
-            extra=(goal,),
-            touching={contact.surface: contact.support},
-            posture_weight=0.3,
-            margin=margin,
-        )
-        problem = replace(
-            problem,
-            ellipse_weight=0.0,
-            com_weight=0.0,
-            clearance=np.where(free, -np.inf, problem.clearance),
-        )
-        solution = ik.solve(problem, nodes[-1], iterations=25)
-        ik.kin.update(solution.q)
-        p = ik.kin.contact_point(contact.surface, support.normal)
-        short = float((p - goal.position) @ support.normal)
-        if solution.status is not Status.SOLVED or short > min(FOLLOWED, 0.5 * depth):
+        node = None
+        while node is None and margins:
+            wanted = top - depth * support.normal
+            node = _node_below(ik, held, contact, wanted, nodes[-1], free, margins[0])
+            if node is None or node[1] > min(FOLLOWED, 0.5 * depth):
+                node, margins = None, margins[1:]
+        if node is None:
             break
-        nodes.append(solution.q)
+        nodes.append(node[0])
         depths.append(depth)
     return nodes, depths
+
+
+def _node_below(
+    ik: IK,
+    held: tuple[Contact, ...],
+    contact: Contact,
+    wanted: np.ndarray,
+    q: np.ndarray,
+    free: np.ndarray,
+    margin: float,
+) -> tuple[np.ndarray, float] | None:
+    """The posture near `q` with a contact at `wanted` (3,), and how far it is short."""
+    world = ik.world
+    support = world.supports[contact.support]
+    goal = ContactGoal(
+        surface=contact.surface,
+        support=contact.support,
+        position=wanted,
+        rotation=support_rotation(support, contact.quaternion),
+        hard=False,
+        reference=ARC_WEIGHT,
+    )
+    problem = balance_problem(
+        world,
+        held=held,
+        q_reference=q,
+        extra=(goal,),
+        touching={contact.surface: contact.support},
+        posture_weight=0.3,
+        margin=margin,
+    )
+    problem = replace(
+        problem,
+        ellipse_weight=0.0,
+        com_weight=0.0,
+        clearance=np.where(free, -np.inf, problem.clearance),
+    )
+    solution = ik.solve(problem, q, iterations=25)
+    if solution.status is not Status.SOLVED:
+        return None
+    ik.kin.update(solution.q)
+    p = ik.kin.contact_point(contact.surface, support.normal)
+    return solution.q, float((p - wanted) @ support.normal)
 
 
 def _limb_over(world: World, contact: Contact) -> np.ndarray:

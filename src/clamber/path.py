@@ -26,10 +26,12 @@ from clamber.transition import CLEARANCE, Transition, balance_problem
 SAFE_HEIGHT = 0.05  # [m] h_safe of (4.29)
 TOP_RISE = 0.05  # [m] both ends on top: the apex is this and h_safe above them
 ARC_POINTS = 12  # control points of an arc, its ends included; at least five
-BRIDGE_POINTS = 3  # between shift, touch and keyframe, where nothing moves far
+BRIDGE_POINTS = 3  # between shift, touch and keyframe, where nothing moves far; at most
+BRIDGE_STEP = 0.1  # [rad, m] of the way from one to the next
 ARC_WEIGHT = 40.0  # of the arc, against posture 0.3 and constraints
 LOOSE_ARC_WEIGHT = 1.0  # ... where a gap is halved, against posture 1
 NODE_ITERATIONS = 25
+NODE_STEP = 0.01  # [rad] a shorter last step leaves nothing of first order to mend
 BRIDGE_MARGIN = 0.01  # [m] of the centre of mass between two balanced postures
 DRIFT_TOL = 0.002  # [m] contacts that drift by more between two postures refine them
 DRIFT_LIMIT = 0.01  # [m] at most, anywhere on the path
@@ -192,7 +194,9 @@ def bridge(
         )
         return _solve_node(ik, problem, q, last)
 
-    return _fill(ik, a, b, BRIDGE_POINTS + 2, node, contacts, ())
+    way = float(np.abs(ik.kin.difference(a, b)).max())
+    points = min(int(way / BRIDGE_STEP), BRIDGE_POINTS)
+    return _fill(ik, a, b, points + 2, node, contacts, ())
 
 
 def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -268,7 +272,7 @@ def _solve_node(
     ik: IK, problem: PostureProblem, q: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
     """Solve from `q`; where that stalls, the better of that and from `other`."""
-    first = ik.solve(problem, q, iterations=NODE_ITERATIONS)
+    first = ik.solve(problem, q, iterations=NODE_ITERATIONS, tolerance=NODE_STEP)
     if first.status is Status.SOLVED:
         return first.q
     second = ik.solve(problem, other)

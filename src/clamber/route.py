@@ -90,7 +90,7 @@ def find_platforms(scene: Scene, goal: np.ndarray) -> tuple[Platform, ...]:
     groups: list[list[tuple[float, float, Support]]] = []
     end = -math.inf
     for t0, t1, top in met:
-        if (t0 - end) * length > GAP or not groups:
+        if (t0 - end) * length > GAP + 1e-9 or not groups:
             groups.append([])
             end = -math.inf
         groups[-1].append((t0, t1, top))
@@ -188,6 +188,21 @@ def find_place(
         return None
     k, name, z = best
     return Place(support=name, position=np.array([*points[k], z]))
+
+
+def room_on(scene: Scene, boxes: tuple[str, ...], xy: np.ndarray) -> float:
+    """From a point (2,) on some boxes to the nearest other one; inf: there is none."""
+    room = math.inf
+    for box in scene.boxes:
+        if box.name not in boxes:
+            corners = _corners(box.top)
+            A, b = _sides(corners)
+            if (A @ xy - b).max() <= 0.0:
+                return 0.0
+            for p, q in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                share = np.clip((xy - p) @ (q - p) / ((q - p) @ (q - p)), 0.0, 1.0)
+                room = min(room, float(np.linalg.norm(p + share * (q - p) - xy)))
+    return room
 
 
 def _height(top: Support, points: np.ndarray) -> np.ndarray:

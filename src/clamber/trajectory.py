@@ -26,7 +26,7 @@ from clamber.path import Phase
 from clamber.posture.keyframe import bearing_frames, torque_limits
 from clamber.retiming import GRID, demand_at, least_torques, retime
 from clamber.se3 import quat_conjugate, quat_multiply
-from clamber.statics import com_margin, contact_forces, support_polygon
+from clamber.statics import com_margins, contact_forces, support_polygon
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
@@ -222,13 +222,13 @@ def _balanced_cruise(
     points = bearing_frames(kin, phase.contacts)[1]
     polygon = support_polygon(points[:, :2])
     low = float(points[:, 2].min())
-    room = np.array([max(com_margin(c, polygon), 0.0) for c in com])
+    room = np.maximum(com_margins(com[:, :2], polygon), 0.0)
     for _ in range(MAX_SLOWINGS):
         s, rate = _profile(length, cruise)[::BALANCE_STRIDE].T
         change = np.gradient(rate, BALANCE_STRIDE / RATE)
         acceleration = path(s, 2) * rate[:, None] ** 2 + path(s, 1) * change[:, None]
         p = zero_moment_point(path(s), acceleration, low)
-        margin = np.array([com_margin(x, polygon) for x in p])
+        margin = com_margins(p, polygon)
         if np.all(margin >= (1.0 - INERTIA_SHARE) * np.interp(s, fine, room)):
             break
         cruise *= SLOWING

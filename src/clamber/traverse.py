@@ -43,7 +43,14 @@ from clamber.policy import (
 )
 from clamber.posture.ik import IK, PostureProblem
 from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
-from clamber.route import Place, Platform, find_place, find_platforms, goal_of
+from clamber.route import (
+    Place,
+    Platform,
+    find_place,
+    find_platforms,
+    goal_of,
+    room_on,
+)
 from clamber.scene import GROUND, Scene
 from clamber.se3 import matrix_from_quat, quat_from_matrix
 from clamber.search import home_at, plan_step, standing
@@ -58,6 +65,9 @@ SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
 NEARLY = 0.12  # [m] ... where it gets no nearer, it may climb down from here
 FACING = 0.15  # [rad] from how it shall face
+# Cycles in a row that bring the goal nearer by less than the second [m] are given up:
+# to turn around on the spot takes 13.
+PATIENCE, NEARER_BY = 20, 0.01
 # Where the body stands before an edge, in lengths of its legs, and what may differ.
 STAND, STAND_TOL = 0.54, 0.12
 BESIDE_TOL = 0.10  # [m] along the edge
@@ -118,6 +128,7 @@ class _Build:
         reach: From the feet to an edge, at most [m].
         tall: Height that hands reach, standing [m].
         thigh: [m]
+        round: Radius of what the body takes up while it turns on all fours [m].
     """
 
     step: dict[str, float]
@@ -128,6 +139,7 @@ class _Build:
     reach: float
     tall: float
     thigh: float
+    round: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -217,8 +229,14 @@ def _follow(task: _Task, key: Keyframe, changes: int, report: Progress) -> Follo
     keyframes, paths, iterations = [key], [], []
     first = cost_to_go(key.stance, task.goal)
     missed, arrived = "", False
+    best, idle = math.inf, 0
     while len(paths) < changes:
         to_go = cost_to_go(keyframes[-1].stance, task.goal)
+        idle = idle + 1 if to_go > best - NEARER_BY else 0
+        best = min(best, to_go) if idle else to_go
+        if idle > PATIENCE:
+            missed = f"{PATIENCE} cycles bring it no nearer to the goal, {to_go:.2f} m"
+            break
         share = 1.0 - min(to_go / max(first, 1e-9), 1.0)
         report("plan", share, f"{to_go:.2f} m to go, {len(paths)} contact changes")
         made, missed = _manoeuvre(task, keyframes[-1])
@@ -344,8 +362,8 @@ def _walk(
     for leg in legs:
         sign = 1.0 if leg.name.startswith("left") else -1.0
         target = body.at(np.array([0.0, sign * task.build.feet]))
-        now = next(c for c in key.stance if c.surface in leg.surfaces)
-        place = Place(support=now.support, position=np.array([*target, 0.0]))
+        now = next((c for c in key.stance if c.surface in leg.surfaces), None)
+        place = Place(support=GROUND, position=np.array([*target, 0.0]))
         found = _attempt(
             task, key, leg.surfaces[0], now, place, body, _home(task, body)
         )
@@ -522,8 +540,8 @@ def _rearranged(task: _Task, key: Keyframe, top: tuple[Contact, ...]) -> list[_M
     option = next(o for o in task.policy.options if o.region == "O")
     for c in top:
         limb = task.ik.world.robot.limb_of(c.surface).name
-        here = _by_limb(task, key.stance)[limb]
-        if np.linalg.norm(c.position - here.position) < SAME:
+        here = _by_limb(task, key.stance).get(limb)
+        if here is not None and np.linalg.norm(c.position - here.position) < SAME:
             continue
         place = Place(support=c.support, position=c.position)
         found = _attempt(task, key, c.surface, here, place, body, task.fours)
@@ -541,6 +559,9 @@ def _on_fours(
 ) -> tuple[list[_Made], str]:
     """One cycle on top, or the descent where it begins."""
     frame = _fours_frame(task, key.stance)
+    made = _set_down(task, key, platform, frame)
+    if made:
+        return made, ""
     if platform.exit is None:
         yaw = frame.yaw if task.goal_yaw is None else task.goal_yaw
         if task.goal_yaw is None and _rises(task, platform):
@@ -556,6 +577,29 @@ def _on_fours(
     if not made and np.linalg.norm(frame.xy - wanted.xy) <= NEARLY:
         return _climb_down(task, key, platform)
     return made, why
+
+
+def _set_down(
+    task: _Task, key: Keyframe, platform: Platform, frame: _Frame
+) -> list[_Made]:
+    """Limbs that lost their contact: where they belong, else where they are."""
+    option = next(o for o in task.policy.options if o.region == "O")
+    robot, made = task.ik.world.robot, []
+    on = _by_limb(task, key.stance)
+    for surface in option.surfaces:
+        limb = robot.limb_of(surface).name
+        if limb in on:
+            continue
+        task.ik.kin.update(key.q)
+        now = task.ik.kin.contact_point(surface, np.array([0.0, 0.0, 1.0]))
+        for wanted in (frame.at(task.build.fours[limb]), now[:2]):
+            place = _place(task, platform, surface, wanted, platform.boxes)
+            found = _attempt(task, key, surface, None, place, frame, task.fours)
+            if not isinstance(found, str):
+                key, path = found
+                made.append((key, path, option.name))
+                break
+    return made
 
 
 def _behind(task: _Task, edge: Edge) -> _Frame:
@@ -603,6 +647,22 @@ def _between(a: _Frame, b: _Frame, step: float, turn: float) -> _Frame:
     return _Frame(a.xy + way / cycles, a.yaw + share)
 
 
+def _heading(task: _Task, platform: Platform, frame: _Frame, wanted: _Frame) -> _Frame:
+    """`wanted`, or the part of the way there before or after the body can turn.
+
+    Between walls it keeps its yaw; where it can turn now but not there, it does so now.
+    """
+    if abs(_apart(frame.yaw, wanted.yaw)) <= FACING:
+        return wanted
+    room, scene = task.build.round, task.ik.world.scene
+    if room_on(scene, platform.boxes, frame.xy) < room:
+        if np.linalg.norm(frame.xy - wanted.xy) > ARRIVED:
+            return _Frame(wanted.xy, frame.yaw)
+    elif room_on(scene, platform.boxes, wanted.xy) < room:
+        return _Frame(frame.xy, wanted.yaw)
+    return wanted
+
+
 def _share(a: _Frame, b: _Frame, share: float) -> _Frame:
     """A part of the way from one to the other."""
     return _Frame(a.xy + share * (b.xy - a.xy), a.yaw + share * (b.yaw - a.yaw))
@@ -618,7 +678,7 @@ def _crawl(
     """One cycle towards `wanted`."""
     option = next(o for o in task.policy.options if o.region == "O")
     step = _crawl_step(task)
-    full = _between(frame, wanted, step, TURN)
+    full = _between(frame, _heading(task, platform, frame, wanted), step, TURN)
     tries = (
         full,
         _share(frame, full, 0.5),
@@ -670,7 +730,10 @@ def _brought_back(
     """
     key, why = made[-1][0], ""
     limb = task.ik.world.robot.limb_of(stuck).name
-    here = _by_limb(task, key.stance)[limb].position[:2]
+    on = _by_limb(task, key.stance)
+    if limb not in on:
+        return [], "a limb without a contact finds no place"
+    here = on[limb].position[:2]
     others = [s for s in option.surfaces if s != stuck]
     # Over a riser it may follow before all are back.
     groups = [[s] for s in others] if _rises(task, platform) else [others]
@@ -761,13 +824,16 @@ def _cycle(
     tops = {n: task.ik.world.supports[n].position[2] for n in platform.boxes}
     for surface in surfaces:
         limb = task.ik.world.robot.limb_of(surface).name
-        here = _by_limb(task, key.stance)[limb]
-        low = tops[here.support] - FLUSH if back else -math.inf
+        here = _by_limb(task, key.stance).get(limb)
+        low = tops[here.support] - FLUSH if back and here else -math.inf
         boxes = [n for n in platform.boxes if tops[n] >= low]
         wanted = body.at(task.build.fours[limb])
         place = _place(task, platform, surface, wanted, boxes)
-        there = np.linalg.norm(place.position - here.position) < SAME
-        if there and surface == here.surface:
+        if (
+            here is not None
+            and surface == here.surface
+            and np.linalg.norm(place.position - here.position) < SAME
+        ):
             continue
         found = _attempt(
             task,
@@ -811,7 +877,7 @@ def _attempt(
     task: _Task,
     key: Keyframe,
     surface: str,
-    here: Contact,
+    here: Contact | None,
     place: Place,
     body: _Frame,
     reference: np.ndarray | None,
@@ -819,20 +885,24 @@ def _attempt(
     shares: Sequence[float] = SHRUNK,
     imposed: bool = True,
 ) -> tuple[Keyframe, Path] | str:
-    """Move one contact to a place, or part of the way there; or why not."""
+    """Move one contact to a place, or part of the way there; or why not.
+
+    A limb without a contact `here` is set down there.
+    """
     world = task.ik.world
     limb = world.robot.limb_of(surface)
     why = ""
     for share in shares:
         position = place.position
         if share < 1.0:
-            if here.support != place.support:
+            if here is None or here.support != place.support:
                 break
             position = here.position + share * (place.position - here.position)
         contact = _contact(
             world, surface, Place(support=place.support, position=position), body.yaw
         )
-        move = Move(limb=limb.name, breaks=(here.surface,), makes=contact, firm=True)
+        breaks = () if here is None else (here.surface,)
+        move = Move(limb=limb.name, breaks=breaks, makes=contact, firm=True)
         step = Step(
             stance=0,
             target=Stance(contacts=()),
@@ -1019,6 +1089,8 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
         reach=STAND * leg + REACH * arm,
         tall=leg + trunk + arm,
         thigh=thigh,
+        # The shanks trail behind the knees.
+        round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
     )
 
 

@@ -232,19 +232,10 @@ def contact_clearance(
         geoms of the surface keep `FURTHER_CLEARANCE`.
     """
     out = clearance.copy()
-    name = world.model.geom
     for surface, support in contacts.items():
-        s, g = world.surfaces[surface], world.support_geom[support]
-        mine = np.isin(world.pairs, s.geoms)
-        here = np.isin(world.pairs, [g]).any(axis=1) & mine.any(axis=1)
-        for i in np.flatnonzero(here):
-            a, b = world.pairs[i]
-            geom = int(a if b == g else b)
-            planned = name(geom).name == surface or s.is_flat
-            if not planned:
-                out[i] = FURTHER_CLEARANCE
-            else:
-                out[i] = 0.0 if surface in rolling else -np.inf
+        planned, further = world.touching[surface, support]
+        out[further] = FURTHER_CLEARANCE
+        out[planned] = 0.0 if surface in rolling else -np.inf
     return out
 
 
@@ -745,19 +736,26 @@ class IK:
         The distance of c from the line through p and q changes by
         n'((1 - t) dp + t dq - dc), t the share of the edge at which c lies abreast.
         """
-        gaps = np.abs(polygon[:, None] - points[None, :, :2]).sum(axis=2)
-        owner = gaps.argmin(axis=1)
-        moves = np.zeros((len(polygon), 2, rows.shape[1]))
-        for i, o in enumerate(owner.tolist()):
+        corners = polygon.tolist()
+        x, y = com.tolist()
+        places = points[:, :2].tolist()
+        moves = []
+        for cx, cy in corners:
+            gaps = [abs(cx - px) + abs(cy - py) for px, py in places]
+            o = gaps.index(min(gaps))
             mover = movers[o]
-            if mover is not None:
-                body, offset = mover
-                moves[i] = self.kin.point_jacobian(body, points[o] + offset)[:2]
-        along = np.roll(polygon, -1, axis=0) - polygon
-        t = ((com - polygon) * along).sum(axis=1) / (along * along).sum(axis=1)
-        t = t[:, None, None]
-        edge = (1.0 - t) * moves + t * np.roll(moves, -1, axis=0)
-        rows -= (A[:, :, None] * edge).sum(axis=1)
+            if mover is None:
+                moves.append(None)
+                continue
+            body, offset = mover
+            moves.append(self.kin.point_jacobian(body, points[o] + offset)[:2].copy())
+        for i, (ax, ay) in enumerate(corners):
+            j = (i + 1) % len(corners)
+            ex, ey = corners[j][0] - ax, corners[j][1] - ay
+            t = ((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey)
+            for move, share in ((moves[i], 1.0 - t), (moves[j], t)):
+                if move is not None:
+                    rows[i] -= (share * A[i]) @ move
 
     def _balance_rows(self, problem: PostureProblem) -> None:
         com = self.kin.com[:2].copy()
@@ -839,25 +837,8 @@ class IK:
 
     def _pair_rows(self, rows: _Rows, near: Proximity) -> slice:
         """Rows whose Jacobian is that of the pairs' distances."""
-        kin = self.kin
         k = rows.take(len(near.pairs))
-        pairs = self.world.pairs[near.pairs]
-        for row, (a, b), n, p1, p2 in zip(
-            range(k.start, k.stop),
-            self._geom_body[pairs],
-            near.normal,
-            near.first,
-            near.second,
-            strict=True,
-        ):
-            if a and b:
-                kin.point_jacobian(int(b), p2, self._jac)
-                kin.point_jacobian(int(a), p1, self._jac2)
-                rows.J[row] = n @ (self._jac - self._jac2)
-            elif b:
-                rows.J[row] = n @ kin.point_jacobian(int(b), p2)
-            else:
-                rows.J[row] = -n @ kin.point_jacobian(int(a), p1)
+        rows.J[k] = self.kin.distance_jacobian(near.pairs, near.first, near.normal)
         return k
 
 
