@@ -726,8 +726,9 @@ def test_a_pair_within_range_that_is_far_enough_has_no_part_in_it(rough):
     both = np.maximum(alone, only(w, other, away[other] - 0.03 - 1e-3))
     one, two = (rough.build(problem_of(w, clearance=x), q) for x in (alone, both))
     assert two.merit == one.merit > 0.0
-    np.testing.assert_array_equal(two.H, one.H)
-    np.testing.assert_array_equal(two.c, one.c)
+    # Rows of one product with more pairs in it may differ in their last bits.
+    np.testing.assert_allclose(two.H, one.H, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(two.c, one.c, rtol=1e-12, atol=1e-13)
 
 
 def test_pairs_that_do_not_count_do_not_count_as_rough_either(rough):

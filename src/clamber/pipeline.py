@@ -34,6 +34,8 @@ VARIATIONS: tuple[dict[str, float], ...] = (
     {"direction_weight": 2.0},
     {"reference_weight": 2.0},
     {"reference_weight": 0.5},
+    {"stability_weight": 4.0},
+    {"balance_margin": 1.4},
 )
 Progress = Callable[[str, float, str], None]
 
