@@ -89,6 +89,7 @@ class JointLaw:
             velocity = (1.0 - follow) * velocity
             error = (1.0 - follow) * error
         self._integral += error * PHYSICS_STEP
-        np.clip(self._integral, -self._limit, self._limit, out=self._integral)
+        np.maximum(self._integral, -self._limit, out=self._integral)
+        np.minimum(self._integral, self._limit, out=self._integral)
         push = self._damping * velocity + torque + self._ki * self._integral
         return reference + push / self._kp

@@ -14,6 +14,7 @@ surface; late and noisy. Nothing else of the physics is looked at.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -134,7 +135,12 @@ class Execution:
         self._law = JointLaw(world)
         self._qadr, self._dadr, self._nv = world.qadr, world.dadr, world.model.nv
         self._surfaces = tuple(world.surfaces)
-        self._limbs = world.robot.limbs.values()
+        # Rows of the surfaces of each arm.
+        self._arms = [
+            [self._surfaces.index(s) for s in limb.surfaces]
+            for limb in world.robot.limbs.values()
+            if limb.is_arm
+        ]
         self._ankles = _ankles(world)
         self._positioned = np.zeros(len(self._qadr))  # share of (4.32), by joint
         self._made = 0 if plan.midway is None else plan.midway.made
@@ -387,7 +393,7 @@ class Execution:
 
     def _set(self, t: Trajectory, i: int) -> None:
         self.reference, self._torque = t.q[i], t.tau[i]
-        self._velocity, self._closed = t.v[i, self._dadr], t.contact[i]
+        self._velocity, self._closed = t.v[i][self._dadr], t.contact[i]
 
     def _resume(self) -> None:
         """Back to the trajectory that was left, little by little while it goes on."""
@@ -525,7 +531,7 @@ class Execution:
         if m.q[3:7] @ q[3:7] < 0:
             q[3:7] *= -1
         q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
-        q[3:7] /= np.linalg.norm(q[3:7])
+        q[3:7] /= math.sqrt(q[3:7] @ q[3:7])
         if self._slow and self._k % LEAN_STRIDE == 0:
             if is_leaning(self._load, self._weight) or self._struck():
                 self._leaning += LEAN_STRIDE * PHYSICS_STEP
@@ -678,19 +684,16 @@ class Execution:
         """
         if not self._ankles:
             return None
-        bearing = all(
-            any(self._load[self._surfaces.index(s), 2] > TOUCH for s in limb.surfaces)
-            for limb in self._limbs
-            if limb.is_arm
-        )
+        up = self._load[:, 2].tolist()
+        bearing = all(any(up[i] > TOUCH for i in rows) for rows in self._arms)
         t = self._trajectory
         ahead = t.contact[min(self._i + round(AHEAD / PHYSICS_STEP), len(t.time) - 1)]
         rate = PHYSICS_STEP / EASING
         for surface, joints in self._ankles.items():
             s = self._surfaces.index(surface)
             free = bearing and self._closed[s] and ahead[s]
-            self._positioned[joints] += rate if free else -rate
-        np.clip(self._positioned, 0.0, 1.0, out=self._positioned)
+            share = float(self._positioned[joints][0]) + (rate if free else -rate)
+            self._positioned[joints] = min(max(share, 0.0), 1.0)
         return self._positioned
 
 

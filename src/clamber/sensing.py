@@ -63,25 +63,26 @@ class Sensors:
         self._ring: list[Measurement] = []
         self._k = 0
         self._force = np.zeros((self._surfaces, 3))
-        self._turn = np.zeros(4)
+        self._off = np.zeros((BLOCK, m.nq))  # of base's place and joints
 
     def read(self, data: mujoco.MjData) -> Measurement:
         """What is known at this physics step; call once for each."""
         i = self._k % BLOCK
         if i == 0:
-            self._angle = self._rng.normal(0.0, ANGLE_NOISE, (BLOCK, len(self._qadr)))
-            self._place = self._rng.normal(0.0, POSITION_NOISE, (BLOCK, 3))
-            self._tilt = self._rng.normal(0.0, ROTATION_NOISE, (BLOCK, 3))
+            angle = self._rng.normal(0.0, ANGLE_NOISE, (BLOCK, len(self._qadr)))
+            self._off[:, self._qadr] = self._noise * angle
+            self._off[:, :3] = self._noise * self._rng.normal(
+                0.0, POSITION_NOISE, (BLOCK, 3)
+            )
+            self._tilt = self._noise * self._rng.normal(0.0, ROTATION_NOISE, (BLOCK, 3))
             n = BLOCK // FORCE_STRIDE + 1
             self._pull = self._rng.normal(0.0, FORCE_NOISE, (n, self._surfaces, 3))
             self._gain = self._rng.normal(
                 0.0, FORCE_SCALE_NOISE, (n, self._surfaces, 1)
             )
-        q = data.qpos.copy()
+        q = data.qpos + self._off[i]
         if self._noise > 0:
-            q[self._qadr] += self._noise * self._angle[i]
-            q[:3] += self._noise * self._place[i]
-            mujoco.mju_quatIntegrate(q[3:7], self._noise * self._tilt[i], 1.0)
+            mujoco.mju_quatIntegrate(q[3:7], self._tilt[i], 1.0)
         if self._k % FORCE_STRIDE == 0:
             j = i // FORCE_STRIDE
             f = surface_forces(data, self._row, self._surfaces)

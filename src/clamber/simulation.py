@@ -169,7 +169,7 @@ def _run(
     ctrl, qpos, qvel, effort, force, unintended = [], [], [], [], [], []
     overlap = speed = 0.0
     tail = round(SETTLE / PHYSICS_STEP)
-    order = [model.actuator(j).id for j in world.joints]
+    order = np.array([model.actuator(j).id for j in world.joints])
     fell, k = False, 0
     while not fell:
         first = k % STRIDE == 0
