@@ -228,9 +228,13 @@ class Execution:
         c = leg.made
         if c is not None:
             near = 0.5 * (leg.swing + leg.touch)
+            # The way to where the leg begins may be what ends a lean.
             yield from self._play(
                 leg.touch,
-                until=lambda: (self._i > near and self._touches(c)) or self._leans(),
+                until=lambda: (
+                    (self._i > near and self._touches(c))
+                    or (self._i > leg.begin and self._leans())
+                ),
             )
             if self._lean is not None:
                 yield from self._withdraw(leg.begin)
@@ -251,15 +255,21 @@ class Execution:
                     yield from self._take(felt)
                     return
                 self._resume()
-        yield from self._play(leg.end)
+        yield from self._play(leg.end, until=self._leans)
         self._leg += 1
         self._tick_off(leg)
+        if self._lean is not None:
+            yield from self._withdraw(leg.touch, leg.made)
+            return
         stance = self._keyframes[self._leg].stance
         self._remember([c for c in stance if self._force(c) >= LOST])
         yield from self._check_stance()
 
-    def _withdraw(self, to: int) -> Ticks:
-        """A part bears where it should not: back, and on with more distance of it."""
+    def _withdraw(self, to: int, made: Contact | None = None) -> Ticks:
+        """A part bears where it should not: back, and on with more distance of it.
+
+        `made` is a contact that bears nothing as yet back there.
+        """
         m, lean = self._world.model, self._lean
         assert lean is not None
         self._lean = None
@@ -269,8 +279,10 @@ class Execution:
         self._wary[key] = KEPT_OFF + max(lean.distance, self._wary.get(key, 0.0))
         self._withdrawals += 1
         yield from self._back(to)
-        stance = tuple(self._other(c) or c for c in self._keyframes[self._leg].stance)
-        yield from self._replan(stance, stance)
+        stance = self._keyframes[self._leg].stance
+        actual = {c: self._other(c) or c for c in stance}
+        loaded = [x for c, x in actual.items() if c is not made]
+        yield from self._replan(tuple(actual.values()), loaded)
 
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
@@ -336,6 +348,9 @@ class Execution:
         stance = self._keyframes[self._leg].stance
         if self._leg == len(self._legs) and not self._more:
             return  # the last one: nothing depends on it
+        if self._leans():  # and takes the load of contacts, which are not lost
+            yield from self._withdraw(self._i)
+            return
         for c in stance:
             if self._force(c) >= LOST or self._other(c) is not None:
                 continue

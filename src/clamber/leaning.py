@@ -6,8 +6,9 @@ slow, so forces and moments balance, those of gravity, of the surfaces and of th
     F = -(m g + sum f_i),        p x F = -(c x m g + sum p_i x f_i).
 
 The second says where on a plane the line of F passes, up to what the noise of the
-forces leaves: a few centimetres. That tells one arm from the other, and the part is the
-one that comes nearest to a support there.
+forces leaves, a few centimetres, and up to where on its sole a foot is borne, which is
+not felt. That tells one arm from the other, and the part is the one that comes nearest
+to a support there.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from clamber.model import Kinematics
 
 MISSING = 0.08  # of the weight that the surfaces do not bear
 SIDEWAYS = 15.0  # [N] and more than the force upwards: a surface strikes a side
-SEARCHED = 0.10  # [m] a support is believed no farther from what leans on it
-AWAY = 0.20  # [m] from the line of the force
+SEARCHED = 0.06  # [m] a support is believed no farther from what leans on it
+AWAY = 0.20  # [m] from the line of the force, besides what soles leave open
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -71,16 +72,27 @@ def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | Non
     points = [kin.contact_point(s, UP) for s in world.surfaces]
     force = -(down + load.sum(axis=0))
     moment = -(np.cross(kin.com, down) + np.cross(points, load).sum(axis=0))
+    open_ = _moment_of_soles(kin, load) / max(force[2], 1e-9)
     own = [g for s in world.surfaces.values() for g in s.geoms]
     best, found = SEARCHED + AWAY, None
     for lean, p in _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) == 0):
         # p x F = M in the plane z = p_z.
         x = (p[2] * force[0] - moment[1]) / force[2]
         y = (p[2] * force[1] + moment[0]) / force[2]
-        away = float(np.hypot(x - p[0], y - p[1]))
+        away = max(float(np.hypot(x - p[0], y - p[1])) - open_, 0.0)
         if away < AWAY and max(lean.distance, 0.0) + away < best:
             best, found = max(lean.distance, 0.0) + away, lean
     return found
+
+
+def _moment_of_soles(kin: Kinematics, load: np.ndarray) -> float:
+    """The most that forces (nS, 3) turn about the middles of flat surfaces [N m]."""
+    flat = [s.is_flat for s in kin.world.surfaces.values()]
+    half = [
+        np.linalg.norm(s.corners - s.centre, axis=1).max()
+        for s in kin.world.surfaces.values()
+    ]
+    return float(np.maximum(load[flat, 2], 0.0) @ np.array(half)[flat])
 
 
 def striking_part(kin: Kinematics, surfaces: Collection[str]) -> Lean | None:

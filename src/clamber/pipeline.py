@@ -236,10 +236,8 @@ def timed(
     phases = [*lead, *(p for path in paths for p in path.phases)]
     if not phases:
         return None
-    ends = len(lead) - 1 + np.cumsum([len(path.phases) for path in paths])
-    return build_trajectory(
-        world, phases, speed=speed, keyframe_after=ends.astype(int).tolist()
-    )
+    ends = np.cumsum([len(lead), *(len(path.phases) for path in paths)])
+    return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
 
 
 class _Clock:

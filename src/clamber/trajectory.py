@@ -323,7 +323,7 @@ def build_trajectory(
     phases: Sequence[Phase],
     *,
     speed: float | Literal["max"],
-    keyframe_after: Sequence[int] = (),
+    keyframe_after: Sequence[int] = (0,),
 ) -> Trajectory:
     """Time the phases one after the other.
 
@@ -331,14 +331,14 @@ def build_trajectory(
         world: Robot and scene.
         phases: In order; each begins with the last posture of the one before.
         speed: Largest joint speed [rad/s]; `max`: as fast as joints and contacts bear.
-        keyframe_after: Index of the phase at whose end each keyframe is reached.
+        keyframe_after: How many phases end before each keyframe is reached.
 
     Raises:
         ValueError: Two phases do not join.
     """
     kin = Kinematics(world)
     surfaces = tuple(world.surfaces)
-    q, v, tau, contact, ends = [], [], [], [], []
+    q, v, tau, contact, ends = [], [], [], [], [0]
 
     def hold(
         seconds: float, phase: Phase, posture: np.ndarray, torque: np.ndarray
@@ -386,5 +386,5 @@ def build_trajectory(
         contact=np.concatenate(contact),
         surfaces=surfaces,
         joints=world.joints,
-        keyframes=np.array([0, *(ends[i] for i in keyframe_after)]) / RATE,
+        keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
     )
