@@ -244,14 +244,12 @@ def test_the_new_trajectory_passes_through_the_new_keyframes(felt):
     _, _, found = felt
     t, kin = found.trajectory, Kinematics(found.world)
     ends = [t.at(x) for x in t.keyframes]
-    assert ends[0] == 0  # in the first one's stance, but not yet in its posture
+    assert ends[0] > 0  # there is a way to the first one
     assert ends == sorted(set(ends))
-    for k, key in zip(ends[1:], found.keyframes[1:], strict=True):
+    for k, key in zip(ends, found.keyframes, strict=True):
         assert np.abs(kin.difference(t.q[k], key.q)).max() < 1e-6
         closed = {s for s, c in zip(t.surfaces, t.contact[k], strict=True) if c}
         assert {c.surface for c in key.stance} <= closed
-    way = [np.abs(kin.difference(q, found.keyframes[0].q)).max() for q in t.q[::5]]
-    assert min(way[: ends[1] // 5]) < 1e-6
     assert t.velocity_error(found.world) < 0.05
 
 

@@ -34,6 +34,7 @@ from clamber.execution import (
     _ankles,
     _legs,
 )
+from clamber.leaning import Lean
 from clamber.model import PHYSICS_STEP, Kinematics
 from clamber.sensing import Measurement
 from clamber.simulation import (
@@ -1011,3 +1012,66 @@ def test_a_limb_on_its_way_may_graze_an_edge(pilot):
     assert not pilot._moves(m.geom(f"{side}Thigh").id)
     pilot._leg = len(pilot._legs)
     assert not pilot._moves(m.geom(f"{side}UpperArm").id)
+
+
+def lean(pilot, begin: int = 0) -> None:
+    """Let the right arm seem to bear what the surfaces do not, from a sample on."""
+    arm = pilot._world.model.geom("RUpperArm").id
+
+    def leans() -> bool:
+        if pilot._i >= begin:
+            pilot._lean = Lean(arm, "box", 0.01)
+        return pilot._lean is not None
+
+    pilot._leans = leans
+
+
+def test_on_the_way_to_where_a_leg_begins_a_lean_may_end(pilot):
+    """There the new plan lifts off what leant; back would be where it did."""
+    leg = pilot._legs[0]
+    pilot._legs[0] = replace(leg, begin=leg.swing - 1)
+    lean(pilot)
+    step = pilot._step()
+    for _ in range(leg.swing - 1 - pilot._i):
+        next(step)
+        assert pilot.events == []
+    next(step)
+    next(step)
+    assert [e.text for e in pilot.events] == [
+        "RShy leans on box: back, to keep it farther away"
+    ]
+    assert pilot._i >= leg.swing - 1
+
+
+def test_what_bears_in_place_of_contacts_is_lifted_before_they_are_called_lost(pilot):
+    exhaust(pilot._play(pilot._legs[0].end))
+    pilot._leg = 1
+    pilot._load[:] = 0.0  # nothing bears
+    lean(pilot)
+    next(pilot._check_stance())
+    assert len(pilot.events) == 1
+    assert "leans on box" in pilot.events[0].text
+    assert pilot._wary
+
+
+def test_what_leans_while_a_contact_is_loaded_takes_it_back_to_its_touch(pilot):
+    """The contact is made, and bears nothing as yet."""
+    leg = pilot._legs[0]
+    pilot._i = leg.touch
+    pilot._set(pilot._trajectory, pilot._i)
+    pilot._touches = lambda c, aside=0.0: True
+    asked = []
+
+    def replan(contacts, loaded):
+        asked.append(({c.surface for c in contacts}, {c.surface for c in loaded}))
+        yield
+
+    pilot._replan = replan
+    lean(pilot, leg.touch + 5)
+    step = pilot._step()
+    while not asked:
+        next(step)
+    assert pilot._i == leg.touch
+    assert pilot._leg == 1
+    both = {c.surface for c in pilot._keyframes[1].stance}
+    assert asked == [(both, both - {leg.made.surface})]

@@ -45,18 +45,24 @@ def lowest(kin: Kinematics, geom: str) -> np.ndarray:
 
 
 def loads(
-    kin: Kinematics, stance, weight: float, force: np.ndarray, p: np.ndarray
+    kin: Kinematics,
+    stance,
+    weight: float,
+    force: np.ndarray,
+    p: np.ndarray,
+    borne: dict[str, np.ndarray] | None = None,
 ) -> np.ndarray:
     """(nS, 3) forces of a stance that balance the weight and a force (3,) at `p`.
 
-    The least of all that do: six equations in the forces of the contacts.
+    The least of all that do: six equations in the forces of the contacts, which act
+    where a surface is lowest or where it is `borne`.
     """
     world = kin.world
     names = list(world.surfaces)
     rows = [names.index(c.surface) for c in stance]
     blocks = []
     for c in stance:
-        x, y, z = kin.contact_point(c.surface, UP)
+        x, y, z = (borne or {}).get(c.surface, kin.contact_point(c.surface, UP))
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         blocks.append(np.vstack([np.eye(3), cross]))
     down = np.array([0.0, 0.0, -weight])
@@ -99,6 +105,26 @@ def test_it_is_found_through_the_noise_of_the_forces(kin, demo_plan, weight, rng
             lean = leaning_part(kin, noisy, weight)
             assert lean is not None
             assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
+
+
+@pytest.mark.parametrize("side", ["L", "R"])
+@pytest.mark.parametrize("end", [0, 1, 2, 3])
+def test_it_is_found_wherever_soles_are_borne(demo_plan, weight, side, end):
+    """Heels or toes: a tenth of a metre that the forces do not tell."""
+    key = demo_plan.keyframes[4]
+    assert {"LFoot", "RFoot", "LElbow", "RElbow"} == {c.surface for c in key.stance}
+    kin = Kinematics(demo_plan.world)
+    kin.update(key.q)
+    feet = {n: kin.world.surfaces[n] for n in ("LFoot", "RFoot")}
+    borne = {
+        n: kin.data.xpos[s.body] + kin.rotation(s.body) @ s.corners[end]
+        for n, s in feet.items()
+    }
+    p = lowest(kin, f"{side}UpperArm")
+    load = loads(kin, key.stance, weight, 0.2 * weight * UP, p, borne)
+    lean = leaning_part(kin, load, weight)
+    assert lean is not None
+    assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
 
 
 def test_where_no_part_is_near_the_force_nothing_is_found(kin, demo_plan, weight):

@@ -964,8 +964,9 @@ def _frames(
                 report("video", i / len(rows), "")
             picture = drawing.shot(rollout.qpos[row], view)
             picture = picture.resize(size, Image.Resampling.BILINEAR)
-            move = int(np.searchsorted(starts, t, side="right"))
-            text = moves[move - 1] if 1 <= move <= len(moves) else "done"
+            # On its way to where the first move begins, it is that one's.
+            move = max(int(np.searchsorted(starts, t, side="right")), 1)
+            text = moves[move - 1] if move <= len(moves) else "done"
             clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
             draw = ImageDraw.Draw(picture)
             line = size[1] - letters - 10
