@@ -550,7 +550,9 @@ def test_how_far_a_contact_is_off(pilot, hands_plan, up, side):
     c = placed(pilot, hands_plan, 1, up, side)
     assert np.allclose(pilot._off(c), (up, abs(side)), atol=1e-3)
     way = "above" if pilot._off(c)[0] > 0 else "below"
-    assert pilot._words(c) == (
+    elbow = replace(c, surface="LElbow")
+    assert pilot._words(c, elbow) == "in place of LElbow"
+    assert pilot._words(c, c) == (
         f"{1e3 * abs(up):.0f} mm {way}, {1e3 * abs(side):.0f} mm beside where it was"
         " planned"
     )

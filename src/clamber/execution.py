@@ -308,7 +308,8 @@ class Execution:
         limb = self._plan.world.robot.limb_of(made.surface)
         after = self._keyframes[self._leg + 1].stance
         stance = [c for c in after if c.surface not in limb.surfaces]
-        self._note(f"{made.surface} touches {self._words(made)}")
+        assert leg.made is not None
+        self._note(f"{made.surface} touches {self._words(made, leg.made)}")
         self._leg += 1
         self._tick_off(leg)
         yield from self._replan((*stance, made), stance)
@@ -367,10 +368,10 @@ class Execution:
                 return
             self._resume()
         actual = tuple(self._other(c) or c for c in stance)
-        for c in actual:
+        for c, planned in zip(actual, stance, strict=True):
             up, side = self._off(c)
-            if c not in stance or abs(up) > DEVIATION or side > DRIFT:
-                self._note(f"{c.surface} is {self._words(c)}")
+            if c is not planned or abs(up) > DEVIATION or side > DRIFT:
+                self._note(f"{c.surface} is {self._words(c, planned)}")
                 yield from self._replan(actual, actual)
                 return
 
@@ -627,7 +628,10 @@ class Execution:
         up = float(off @ n)
         return up, float(np.linalg.norm(off - up * n))
 
-    def _words(self, c: Contact) -> str:
+    def _words(self, c: Contact, planned: Contact) -> str:
+        """Where a contact is; `planned` may be of another surface of its limb."""
+        if c.surface != planned.surface:
+            return f"in place of {planned.surface}"
         up, side = self._off(c)
         way = "above" if up > 0 else "below"
         return (
