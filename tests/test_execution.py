@@ -1077,3 +1077,21 @@ def test_what_leans_while_a_contact_is_loaded_takes_it_back_to_its_touch(pilot):
     assert pilot._leg == 1
     both = {c.surface for c in pilot._keyframes[1].stance}
     assert asked == [(both, both - {leg.made.surface})]
+
+
+@pytest.mark.parametrize("bears", ["LHand", "LElbow"])
+def test_what_bears_in_place_of_a_contact_strikes_no_side(pilot, bears):
+    """A hand in the stance, or the elbow that has come to lie there instead."""
+    pilot._i = pilot._legs[0].end
+    pilot._leg = 1
+    pilot._pose = pilot._keyframes[1].q.copy()
+    top = pilot._world.supports["box"]
+    pilot._kin.update(pilot._pose)
+    elbow = pilot._kin.contact_point("LElbow", top.normal)
+    pilot._load[:] = 0.0
+    pilot._load[pilot._surfaces.index(bears)] = [2.0 * TOUCH, 0.0, 1.5 * TOUCH]
+    pilot._pose[2] -= 0.0 if bears == "LHand" else top.height(elbow)
+    assert pilot._struck() == []
+    # A knee bears in place of no contact: it strikes.
+    pilot._load[pilot._surfaces.index("LKnee")] = [2.0 * TOUCH, 0.0, 0.0]
+    assert pilot._struck() == ["LKnee"]

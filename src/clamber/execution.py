@@ -561,6 +561,8 @@ class Execution:
             return hit
         j = self._leg
         near = {c.surface for key in self._keyframes[j : j + 2] for c in key.stance}
+        others = map(self._other, self._keyframes[j].stance)
+        near.update(c.surface for c in others if c is not None)
         made = self._next_made()
         if made is not None:
             near.update(self._world.robot.limb_of(made.surface).surfaces)
