@@ -37,7 +37,7 @@ def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> N
         tab.wait_for_selector("text=go to", state="attached")
         tab.add_style_tag(content=".mantine-Notification-root {display: none}")
         tab.wait_for_timeout(3000)
-        switch(tab, "fine shapes")  # shadows too: a processor may take its time here
+        switch(tab, "fine in motion")  # shadows too: a processor may take its time here
         if width > 600:
             tab.get_by_role("tab", name="Show").click()
             switch(tab, "recording")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -165,6 +167,37 @@ def test_a_large_mesh_is_cut_down_and_a_small_one_is_not(model: mujoco.MjModel):
     large = spec.compile()
     assert len(body_meshes(large)[0].triangles) > 30_000
     assert len(body_meshes(large, max_triangles=5000)[0].triangles) <= 5000
+
+
+@pytest.mark.parametrize("deviation", [0.01, 0.005, 0.001])
+def test_faces_are_no_farther_off_than_was_asked_and_no_more_than_that(
+    model: mujoco.MjModel, deviation: float
+):
+    """Of the ball of 0.1 m, around its equator; large shapes have more faces."""
+    spec = mujoco.MjSpec.from_string(SHAPES)
+    for geom in spec.geoms:
+        if geom.name != "sphere":
+            geom.rgba = [1, 1, 1, 0]
+    ball = body_meshes(spec.compile(), deviation=deviation)[-1]
+    middle = ball.vertices[np.abs(ball.vertices[:, 2]) < 1e-9]
+    middle = np.unique(middle.round(9), axis=0)
+    corners = len(middle)
+    inside = 0.1 * (1 - math.cos(math.pi / corners))
+    assert inside <= deviation
+    assert 0.1 * (1 - math.cos(math.pi / (corners - 1))) > deviation
+    sizes = {
+        r: len(body_meshes(balls(r), deviation=deviation)[0].triangles)
+        for r in (0.02, 0.1)
+    }
+    assert sizes[0.02] < sizes[0.1]
+
+
+def balls(radius: float) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(name="b").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0]
+    )
+    return spec.compile()
 
 
 def test_the_built_in_robot_has_a_mesh_for_each_body_that_shows():

@@ -340,6 +340,29 @@ def test_a_link_that_has_not_moved_is_not_sent(kept: Any, ran: Shown):
     assert [name.count("/") for name in sent] == [2]
 
 
+def test_a_ghost_is_sent_where_it_is_seen_and_what_that_hangs_in(kept: Any, ran: Shown):
+    from clamber.view.stage import Links
+
+    links = Links(kept, "/ghost", ran.world, ran.meshes, ghost=True)
+    frame = frame_at(ran, Kinematics(ran.world), ran.duration / 2)
+    nodes, seen = kept.scene.nodes, np.zeros(len(ran.meshes), dtype=bool)
+    for node in nodes.values():
+        node.__dict__["sent"] = []
+    links.pose(frame.poses, seen)
+    assert not any("position" in n.sent or "wxyz" in n.sent for n in nodes.values())
+    assert not any(n.visible for name, n in nodes.items() if "/mesh/" in name)
+    deepest = max((n for n in nodes if "/mesh" not in n), key=lambda n: n.count("/"))
+    body = int(deepest.split("/")[-1])
+    seen[[m.body for m in ran.meshes].index(body)] = True
+    links.pose(frame.poses, seen)
+    shown = {n.split("/mesh")[0] for n, x in nodes.items() if getattr(x, "visible", 0)}
+    assert shown == {deepest}
+    moved = {n for n, x in nodes.items() if "wxyz" in x.sent or "position" in x.sent}
+    chain = {deepest[:i] for i, c in enumerate(deepest) if c == "/"} | {deepest}
+    assert moved <= chain
+    assert deepest in moved
+
+
 def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
     from clamber.view.stage import CONE_HEIGHT, cones, discs
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-SLICES = 28  # around a round geom
+SLICES, FEWEST_SLICES = 28, 6  # around a round geom
 SHOWN_GROUPS = (0, 1, 2)  # of geoms, in MuJoCo's viewer
 MAX_TRIANGLES = 60_000  # of all mesh geoms together
 CREASE = math.radians(40.0)  # an edge that turns by more is sharp
@@ -52,14 +52,17 @@ _Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices, normals, tri
 
 
 def body_meshes(
-    model: mujoco.MjModel, *, max_triangles: int = MAX_TRIANGLES, slices: int = SLICES
+    model: mujoco.MjModel,
+    *,
+    max_triangles: int = MAX_TRIANGLES,
+    deviation: float = 0.0,
 ) -> list[Mesh]:
     """The visible geoms of each body, tessellated; bodies that show nothing left out.
 
     Args:
         model: Compiled.
         max_triangles: More than these in mesh geoms are simplified.
-        slices: Faces around a round geom.
+        deviation: That faces may be off a round geom [m]: small ones get fewer.
     """
     shown = np.flatnonzero(
         np.isin(model.geom_group, SHOWN_GROUPS)
@@ -74,7 +77,7 @@ def body_meshes(
     keep = min(1.0, max_triangles / max(faces, 1))
     by_body: dict[int, list[tuple[_Triangles, np.ndarray]]] = {}
     for g in shown:
-        part = geom_triangles(model, int(g), keep, slices)
+        part = geom_triangles(model, int(g), keep, _slices(model, int(g), deviation))
         if part is not None:
             colour = geom_colour(model, int(g))[:3]
             by_body.setdefault(int(model.geom_bodyid[g]), []).append((part, colour))
@@ -146,6 +149,17 @@ def geom_triangles(
     mujoco.mju_quat2Mat(R, model.geom_quat[geom])
     R = R.reshape(3, 3)
     return v @ R.T + model.geom_pos[geom], n @ R.T, f
+
+
+def _slices(model: mujoco.MjModel, geom: int, deviation: float) -> int:
+    """Faces around a round geom so that none is farther inside it than that [m]."""
+    size = model.geom_size[geom]
+    long = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    radius = float(size.max() if long else size[0])
+    if deviation <= 0.0 or radius <= 0.0:
+        return SLICES
+    half = math.acos(max(0.0, 1.0 - deviation / radius))
+    return min(max(math.ceil(math.pi / half), FEWEST_SLICES), SLICES)
 
 
 def _round(radius: float, half: float, slices: int) -> np.ndarray:
