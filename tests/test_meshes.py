@@ -142,6 +142,35 @@ def test_a_simplified_mesh_is_small_and_still_the_same_shape():
     assert len(simplified(v, f, 0)[1]) == 0  # ends, whatever is asked
 
 
+def test_flat_faces_stay_flat_and_edges_sharp_when_a_mesh_is_simplified():
+    """A cube of many triangles, off the grid: corners and volume are kept."""
+    n = 40
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    quads = np.stack([i, i + 1, i + 1, i], axis=-1), np.stack([j, j, j + 1, j + 1], -1)
+    u, w = (x.reshape(-1, 4) / n for x in quads)
+    patches = []
+    for axis in range(3):
+        for side in (0.0, 1.0):
+            p = np.zeros((len(u), 4, 3))
+            p[..., axis] = side
+            p[..., (axis + 1) % 3], p[..., (axis + 2) % 3] = u, w
+            patches.append(p if side else p[:, ::-1])
+    corners = np.concatenate(patches).reshape(-1, 3)
+    v, index = np.unique(corners.round(9), axis=0, return_inverse=True)
+    quad = index.reshape(-1, 4)
+    f = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+    turn, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
+    turn *= np.linalg.det(turn)
+    assert volume(v @ turn.T, f) == pytest.approx(1.0)
+    w, g = simplified(v @ turn.T, f, 400)
+    assert 60 < len(g) <= 400
+    assert volume(w, g) == pytest.approx(1.0, rel=0.01)  # 0.9 with means of cells
+    back = w[np.unique(g)] @ turn
+    assert np.abs(np.clip(back, 0, 1) - back).max() < 0.01
+    face = np.minimum(np.abs(back), np.abs(1 - back)).min(axis=1)
+    assert face.max() < 0.01
+
+
 def test_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     w, n, _ = shaded(*fine_sphere())
     at = np.abs(w[:, 2]) < 0.9  # not the poles, whose faces are slivers

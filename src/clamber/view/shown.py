@@ -47,8 +47,8 @@ AT_REST = 0.15  # [s] around a keyframe its forces are shown where physics has n
 ARROW = 2 * FORCE_LENGTH  # [m] of the robot's weight: out of the limb it begins in
 PUSH_SCALE = 2.0  # arrows of pushes are so much longer than those of contact forces
 LEAST_FORCE = 0.005  # [weights] smaller forces are no arrow
-# Of shapes that a processor draws in time, at a pixel for 4 mm.
-DEVIATION, MAX_TRIANGLES = 0.005, 6_000
+# Of shapes that a processor draws in time, at a pixel for 4 mm; and of those at rest.
+DEVIATION, MAX_TRIANGLES, FINE_TRIANGLES = 0.005, 6_000, 20_000
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
 STATES = STRIDE * PHYSICS_STEP  # [s] between two recorded states
 MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
@@ -212,7 +212,7 @@ def show_run(
         meshes=tuple(
             body_meshes(world.model, deviation=DEVIATION, max_triangles=MAX_TRIANGLES)
         ),
-        fine=tuple(body_meshes(world.model)),
+        fine=tuple(body_meshes(world.model, max_triangles=FINE_TRIANGLES)),
         time=time,
         q=q,
         reference=reference,
