@@ -76,6 +76,8 @@ _MAKERS = {
     ROLLOUT: "simulate",
     EXECUTION: "simulate",
     VERDICT: "simulate",
+    PLANNED_SCENE: "simulate",
+    PLANNED_TRAJECTORY: "simulate",
 }
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
 _OF_AN_EARLIER_PLAN = (
