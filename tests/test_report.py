@@ -333,8 +333,11 @@ def test_what_is_broken_is_named_and_the_rest_is_shown(
     else:
         file.write_text('{"hello": "world"}')
     record = report.run_record(run)
-    if (name, how) != ("rollout.npz", "gone"):  # then it is a plan with a verdict
-        assert any(m.startswith(name) for m in record["missing"]), record["missing"]
+    named = f"no {name}" if (name, how) == ("rollout.npz", "gone") else name
+    said = [m for m in record["missing"] if m.startswith(named)]
+    assert said, record["missing"]
+    if how != "foreign":
+        assert all("writes it" in m for m in said if name != "timings.json"), said
     assert all("\n" not in m for m in record["missing"])
     shown = {k for k in ("criteria", "keyframes", "motion") if record[k]}
     assert shown == kept

@@ -1094,7 +1094,8 @@ def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
     except (ValueError, KeyError, IndexError) as e:
         reason = " ".join(str(e.args[0] if e.args else e).split())
         raise InputError(
-            f"the robot and the boxes of {PLAN} as MJCF ({reason})", source=path
+            f"the robot and the boxes of {PLAN} as MJCF ({reason}); {_maker(path)}",
+            source=path,
         ) from e
 
 

@@ -133,8 +133,12 @@ def read_run(folder: Path) -> Run:
     execution = reading.fields(EXECUTION) if ran or reading.has(EXECUTION) else {}
     verdict = reading.fields(VERDICT) if ran or reading.has(VERDICT) else {}
     timings = reading.fields(TIMINGS)
-    if written and not ran and not verdict:
-        reading.missing.append(f"no {ROLLOUT}: the plan has not been run in physics")
+    if written and not ran:
+        if verdict or execution:
+            text = "it has been run in physics; `clamber simulate` writes it anew"
+        else:
+            text = "the plan has not been run in physics"
+        reading.missing.append(f"no {ROLLOUT}: {text}")
     return Run(
         folder=folder,
         written=written,
