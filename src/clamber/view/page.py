@@ -43,6 +43,14 @@ DARK, FINE = "dark", "fine in motion"
 AT_REST = 0.6  # [s] after which what has not moved is drawn finely
 # What the browser wants is handed to the checkboxes: its own scheme; shadows and all
 # faces in motion too, unless a processor draws: they take longer than all the rest.
+# Where it does, it draws a quarter of the pixels while something moves: from the start.
+_SET_RESOLUTION = (
+    "const v=window.__viserTestpoints;"
+    "if(window.clamberSoft&&v&&v.devSettings&&v.devSettings.set)"
+    "v.devSettings.set({{fixedDpr:{}}});"
+)
+RESOLUTION = f'<img src="data:," style="display:none" onerror="{_SET_RESOLUTION}">'
+COARSE, ALL_PIXELS = "0.5", "null"
 WISHES = (
     '<img src="data:," style="display:none" onerror="'
     "const g=document.createElement('canvas').getContext('webgl2'),"
@@ -58,7 +66,8 @@ WISHES = (
     "if(wish[l.textContent.trim()]){"
     "let e=l;while(!e.querySelector('input'))e=e.parentElement;"
     "const i=e.querySelector('input');if(!i.checked)i.click()}"
-    "if(window.clamberSoft){this.nextElementSibling.style.display='block';"
+    + _SET_RESOLUTION.format(COARSE)
+    + "if(window.clamberSoft){this.nextElementSibling.style.display='block';"
     "for(const n of document.querySelectorAll('.mantine-Notification-root'))"
     "if(/Software WebGL/.test(n.textContent))n.querySelector('button').click()}"
     '"><div style="display:none">'
@@ -67,13 +76,6 @@ WISHES = (
         "faces and shadows at rest.</p>"
     )
     + "</div>"
-)
-# Where a processor draws, it draws a quarter of the pixels while something moves.
-RESOLUTION = (
-    '<img src="data:," style="display:none" onerror="'
-    "const v=window.__viserTestpoints;"
-    "if(window.clamberSoft&&v&&v.devSettings&&v.devSettings.set)"
-    'v.devSettings.set({{fixedDpr:{}}})">'
 )
 
 
@@ -395,7 +397,7 @@ class Page:
             return
         own.drawn_finely = finely
         with own.client.atomic():
-            own.resolution.content = RESOLUTION.format("null" if finely else "0.5")
+            own.resolution.content = RESOLUTION.format(ALL_PIXELS if finely else COARSE)
             _light(own)
             for tell in self._refiners:
                 tell(own.client, finely)
