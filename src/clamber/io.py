@@ -73,6 +73,7 @@ _MAKERS = {
     PLAN: "plan",
     TRAJECTORY: "plan",
     SCENE: "plan",
+    TIMINGS: "plan",
     ROLLOUT: "simulate",
     EXECUTION: "simulate",
     VERDICT: "simulate",
@@ -266,6 +267,8 @@ class _Arrays:
                 self._arrays = {k: f[k] for k in f.files}
         except _UNREADABLE as e:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else e
+            if "pickle" in str(e):  # what numpy takes any other content for
+                reason = "it holds something else"
             raise InputError(
                 f"a whole .npz file ({reason}); {_maker(path)}", source=path
             ) from e
