@@ -231,6 +231,13 @@ def test_saving_writes_a_run_of_its_own_and_overwrites_nothing(
     first, second = (edits.save_edited(tmp_path, again) for _ in range(2))
     assert [first.name, second.name] == ["edited", "edited-2"]
     assert {p.name for p in tmp_path.iterdir()} == {"edited", "edited-2"}
+    elsewhere = tmp_path.parent / f"{tmp_path.name}-elsewhere"
+    elsewhere.mkdir()
+    for n, target in ((3, elsewhere), (4, tmp_path / "nowhere")):
+        (tmp_path / f"edited-{n}").symlink_to(target)  # nobody's way out of the folder
+    assert edits.save_edited(tmp_path, again).name == "edited-5"
+    assert not list(elsewhere.iterdir())
+    assert not (tmp_path / "nowhere").exists()
     assert clamber.load_plan(first).complete
     back = clamber.load_sequence(first)
     assert [c.firm for c in back.stances[1].contacts] == [False, False, True]

@@ -40,7 +40,7 @@ from clamber.view.shown import (
     way_at,
     weight_of,
 )
-from clamber.viz import bearing_of
+from clamber.viz import PHASE_COLOURS, bearing_of
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -364,7 +364,7 @@ def test_a_ghost_is_sent_where_it_is_seen_and_what_that_hangs_in(kept: Any, ran:
 
 
 def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
-    from clamber.view.stage import CONE_HEIGHT, cones, discs
+    from clamber.view.stage import CONE_HEIGHT, cones, discs, linear
 
     tilted = np.array([0.0, math.sin(0.3), math.cos(0.3)])
     touches = [
@@ -392,6 +392,10 @@ def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
         mujoco.mju_rotVecQuat(axis, UP, node.batched_wxyzs[i])
         np.testing.assert_allclose(axis, touch.normal, atol=1e-12)
     assert np.all(node.batched_scales[2:] < 1e-3)  # the others are not there
+    dark, mid, light = linear((0, 188, 255))  # mid grey is half of the light
+    assert (dark, mid, light) == (0, 128, 255)
+    for colour, touch in zip(node.batched_colors, touches, strict=False):
+        assert colour.tolist() == linear(PHASE_COLOURS[touch.phase]).tolist()
     discs(kept, "/discs", 4).show(touches)
     flat = kept.scene.nodes["/discs"]
     assert flat.batched_scales[0].tolist() == flat.batched_scales[1].tolist()

@@ -44,7 +44,7 @@ GHOST = (59, 130, 246)
 PUSH = (162, 28, 175)
 BALANCE, ELLIPSE, COM = (37, 99, 235), (8, 145, 178), (217, 70, 239)
 WAY, WAY_LINE, WAY_SIDES = (124, 58, 237), 0.007, 8  # width of the line [m]
-PERSON, PERSON_BOX = (71, 105, 150), (203, 188, 165)
+PERSON, PERSON_BOX = (144, 172, 201), (203, 188, 165)
 BONE, JOINT, HEAD = 0.022, 0.03, 0.1  # [m] radii
 MOST_PARTS = 16  # of a person that are in contact at once
 DISC, DISC_HEIGHT, LIFT = 0.055, 0.004, 0.002  # [m]
@@ -67,6 +67,13 @@ LAYERS = {  # name in the page: shown at first
     "way of the limb": True,
     RECORDING: False,
 }
+
+
+def linear(colour: Collection[int]) -> np.ndarray:
+    """(3,) uint8: an sRGB colour as the parts of a node with many of them take theirs."""
+    c = np.array([*colour]) / 255
+    light = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * light).astype(np.uint8)
 
 
 class Links:
@@ -299,7 +306,7 @@ class Marks:
             q[i] = quat_from_matrix(frame_from_normal(touch.normal, [1.0, 0.0, 0.0]))
             wide = touch.friction if self._by_friction else 1.0
             scale[i] = [wide, wide, 1.0]
-            colour[i] = PHASE_COLOURS[touch.phase]
+            colour[i] = linear(PHASE_COLOURS[touch.phase])
         self.node.batched_positions, self.node.batched_wxyzs = p, q
         self.node.batched_scales, self.node.batched_colors = scale, colour
 
@@ -489,10 +496,10 @@ class Stage:
             arrow = force_arrow(self._shown.world, touch)
             if arrow is not None:
                 arrows.append(arrow)
-                colours.append(PHASE_COLOURS[touch.phase])
+                colours.append(linear(PHASE_COLOURS[touch.phase]))
         if frame.push is not None:
             arrows.append(frame.push)
-            colours.append(PUSH)
+            colours.append(linear(PUSH))
         self._arrows.visible = bool(arrows) and self._layers["forces"]
         if self._arrows.visible:
             self._arrows.colors = np.array(colours, dtype=np.uint8)
@@ -531,21 +538,23 @@ class Stick:
             np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             np.zeros((count, 3)),
             batched_scales=np.ones((count, 3)),
-            batched_colors=PERSON,
+            batched_colors=linear(PERSON),
             **common,
         )
         ball, triangles = tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2e-6]]), JOINT)
-        size = np.ones(joints)
-        if "Head" in person.demo.names:
-            size[-1] = HEAD / JOINT
+        self._head = None
+        if "Head" in person.demo.names:  # the last of the joints
+            self._head = add.add_icosphere(
+                f"{root}/head", radius=HEAD, subdivisions=2, color=PERSON
+            )
         self._joints = add.add_batched_meshes_simple(
             f"{root}/joints",
             ball,
             triangles,
             np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)),
             np.zeros((joints, 3)),
-            batched_scales=size,
-            batched_colors=PERSON,
+            batched_scales=np.ones(joints),
+            batched_colors=linear(PERSON),
             **common,
         )
         self._discs = discs(server, f"{root}/contacts", MOST_PARTS)
@@ -565,4 +574,6 @@ class Stick:
         scale[~figure.seen] = HIDDEN
         self._bones.batched_scales = scale
         self._joints.batched_positions = figure.joints
+        if self._head is not None:
+            self._head.position = figure.joints[-1]
         self._discs.show(figure.touches)
