@@ -70,7 +70,7 @@ LAYERS = {  # name in the page: shown at first
 
 
 def linear(colour: Collection[int]) -> np.ndarray:
-    """(3,) uint8: an sRGB colour as the parts of a node with many of them take theirs."""
+    """(3,) uint8: an sRGB colour as nodes of many parts take theirs."""
     c = np.array([*colour]) / 255
     light = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return np.round(255 * light).astype(np.uint8)
