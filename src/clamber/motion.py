@@ -455,7 +455,8 @@ def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> np.ndarray:
 def steadily_loaded(rollout: Rollout) -> np.ndarray:
     """(M, nS) bool, the surfaces that bear; gaps, then touches, below 60 ms left out.
 
-    A stiff contact that rolls is without force for a step now and then.
+    A stiff contact that rolls is without force for a step now and then; one in which
+    the run begins, until it has been pressed.
     """
     loaded = loaded_surfaces(rollout.world, rollout)
     last = len(rollout.time) - 1
@@ -463,7 +464,7 @@ def steadily_loaded(rollout: Rollout) -> np.ndarray:
     for column in loaded.T:
         for state in (True, False):
             for a, b in runs_of(column != state):
-                if 0 < a and b <= last and (b - a) * step < SHORTEST_LOAD:
+                if (a > 0 or state) and b <= last and (b - a) * step < SHORTEST_LOAD:
                     column[a:b] = state
     return loaded
 
