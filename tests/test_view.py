@@ -9,6 +9,7 @@ import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -330,3 +331,36 @@ def test_a_port_in_use_takes_the_next_one(whole: Path):
         page.close()
     assert page.host == "127.0.0.1"
     assert page.wanted == taken < page.port < taken + 50
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "said", "not_said"),
+    [
+        ("127.0.0.1", 8080, ["ssh -L 8080:127.0.0.1:8080 "], ["in use", "can edit"]),
+        ("127.0.0.1", 8083, ["port 8080 is in use: 8083", "ssh -L 8083"], []),
+        ("0.0.0.0", 8080, [f"http://{socket.gethostname()}:8080; ", "save"], ["ssh"]),
+        ("10.0.0.7", 8080, ["http://10.0.0.7:8080"], ["ssh", "can edit"]),
+    ],
+)
+def test_the_command_says_how_to_get_to_the_page(
+    host: str,
+    port: int,
+    said: list[str],
+    not_said: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    page = SimpleNamespace(
+        host=host, port=port, wanted=8080, missing=[], url=f"http://{host}:{port}"
+    )
+    page.close = lambda: None
+    monkeypatch.setattr("clamber.view.open_view", lambda *_, **__: page)
+
+    def interrupted(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", interrupted)
+    assert cli.main(["view", "climb"]) == 0
+    out = capsys.readouterr().out
+    assert all(text in out for text in said), out
+    assert not any(text in out for text in not_said), out

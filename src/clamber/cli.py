@@ -770,6 +770,11 @@ class ViewCommand:
                 f"from another machine: ssh -L {page.port}:127.0.0.1:{page.port}"
                 f" {socket.gethostname()}, then the same address there"
             )
+        elif page.host in ("0.0.0.0", "::"):
+            lines.append(
+                f"from another machine: http://{socket.gethostname()}:{page.port}; "
+                "whoever reaches it can edit and save"
+            )
         record = {"url": page.url, "port": page.port, "missing": page.missing}
         self.output.show(record, note="\n".join(lines))
         sys.stdout.flush()

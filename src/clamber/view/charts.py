@@ -76,6 +76,7 @@ STYLE = """<style>
 .clamber [data-t] { cursor: pointer; }
 .clamber tbody[data-t]:hover, .clamber-now { background: var(--soft); }
 .clamber .wide td { vertical-align: top; }
+.clamber .wide td:last-child { white-space: nowrap; }
 .clamber tbody { border-top: 1px solid var(--rule); }
 .clamber .move td { font-weight: 600; padding-top: 4px; text-align: left; }
 .clamber .never { opacity: 0.55; }
