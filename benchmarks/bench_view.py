@@ -1,13 +1,14 @@
 """How many states of a run the browser draws in a second, and where the time goes.
 
-    python benchmarks/bench_view.py [RUN] [--size 1280x800] [--seconds 5]
+    python benchmarks/bench_view.py [RUN] [--size 1280x800] [--seconds 5] [--rounds 3]
 
 Plays a run (by default the built-in climb, planned and simulated first) in headless
 Chromium, which has no GPU here: its software renderer draws. Counted in the page, while
 it plays: frames that were rendered, and among them those in which the robot's bodies
 were not where they were in the one before. An empty viser page of the same size, in
-which a single node moves, shows what the renderer can do at most. The columns in ms are
-processor time a frame. On an idle machine, or the figures are the machine's.
+which a single node moves, shows what the renderer can do at most at that moment: all
+are measured in turn, and medians of the rounds shown. The columns in ms are processor
+time a frame. On an idle machine, or the figures are the machine's.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import viser
@@ -227,11 +229,23 @@ def play_run(
         page.close()
 
 
+def middle(rounds: list[Measured]) -> Measured:
+    """Of each figure the median."""
+    return replace(
+        rounds[0],
+        **{
+            x.name: median(getattr(m, x.name) for m in rounds)
+            for x in fields(Measured)
+            if x.name != "canvas"
+        },
+    )
+
+
 def show(name: str, m: Measured) -> None:
     """A line of the table."""
     print(
         f"{name:24}{m.states:9.1f}{m.frames:9.1f}{m.sent:8.1f}{m.drawing:9.1f}"
-        f"{m.page:7.1f}{m.server:8.1f}{m.calls:7}{m.triangles:11}  {m.canvas}",
+        f"{m.page:7.1f}{m.server:8.1f}{m.calls:7.0f}{m.triangles:11.0f}  {m.canvas}",
         flush=True,
     )
 
@@ -253,6 +267,7 @@ def main() -> None:
     parser.add_argument("run", nargs="?")
     parser.add_argument("--size", default="1280x800")
     parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--rounds", type=int, default=3)
     asked = parser.parse_args()
     width, height = (int(x) for x in asked.size.split("x"))
     size, seconds = (width, height), asked.seconds
@@ -270,22 +285,27 @@ def main() -> None:
             f"{'':24}{'states/s':>9}{'frames/s':>9}{'sent/s':>8}{'draw ms':>9}"
             f"{'page':>7}{'server':>8}{'calls':>7}{'triangles':>11}  canvas"
         )
-        with empty_page() as (url, count):
-            m = measure(
-                browser,
-                url,
-                size,
-                seconds,
-                root="/moves",
-                play=lambda tab: None,
-                sent=count,
-            )
-        show("empty viser page", m)
-        show("run, as it opens", play_run(browser, run, size, seconds, {}))
         bare = {name: False for name, on in LAYERS.items() if on}
-        show("robot alone", play_run(browser, run, size, seconds, bare))
         every = {name: True for name, on in LAYERS.items() if not on}
-        show("all layers", play_run(browser, run, size, seconds, every))
+        kinds = {"run, as it opens": {}, "robot alone": bare, "all layers": every}
+        found: dict[str, list[Measured]] = {}
+        for _ in range(asked.rounds):
+            with empty_page() as (url, count):
+                m = measure(
+                    browser,
+                    url,
+                    size,
+                    seconds,
+                    root="/moves",
+                    play=lambda tab: None,
+                    sent=count,
+                )
+            found.setdefault("empty viser page", []).append(m)
+            for name, layers in kinds.items():
+                m = play_run(browser, run, size, seconds, layers)
+                found.setdefault(name, []).append(m)
+        for name, rounds in found.items():
+            show(name, middle(rounds))
         browser.close()
 
 

@@ -37,13 +37,12 @@ def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> N
         tab.wait_for_selector("text=go to", state="attached")
         tab.add_style_tag(content=".mantine-Notification-root {display: none}")
         tab.wait_for_timeout(3000)
-        switch(tab, "fine shapes")  # shadows too: a processor may take its time here
         if width > 600:
             tab.get_by_role("tab", name="Show").click()
             switch(tab, "recording")
             tab.get_by_role("tab", name="Stances").click()
         tab.wait_for_timeout(1000)
-        page.clock.go(0.68 * page.clock.end)
+        page.clock.go(0.56 * page.clock.end)
         tab.wait_for_timeout(4000)
         tab.screenshot(path=out, type="jpeg", quality=72)
         browser.close()

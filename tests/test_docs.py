@@ -26,6 +26,7 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -216,7 +217,11 @@ class Session:
         with contextlib.redirect_stdout(out):
             if words[0] == "clamber":
                 end = _redirected(words)
-                code = cli.main(list(words[1:end]))
+                with pytest.MonkeyPatch.context() as patch:
+                    if words[1] == "view":  # a person looks, and presses Ctrl-C
+                        pytest.importorskip("viser")
+                        patch.setattr(cli, "time", SimpleNamespace(sleep=_interrupted))
+                    code = cli.main(list(words[1:end]))
             elif words[:2] == ["python", "-c"]:
                 exec(compile(words[2], "<docs>", "exec"), {})
                 code = 0
@@ -228,6 +233,10 @@ class Session:
                     runpy.run_path(script, run_name="__main__")
                 code = 0
         return code, out.getvalue()
+
+
+def _interrupted(_: float) -> None:
+    raise KeyboardInterrupt
 
 
 def run_block(block: Block, session: Session) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -140,6 +142,35 @@ def test_a_simplified_mesh_is_small_and_still_the_same_shape():
     assert len(simplified(v, f, 0)[1]) == 0  # ends, whatever is asked
 
 
+def test_flat_faces_stay_flat_and_edges_sharp_when_a_mesh_is_simplified():
+    """A cube of many triangles, off the grid: corners and volume are kept."""
+    n = 40
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    quads = np.stack([i, i + 1, i + 1, i], axis=-1), np.stack([j, j, j + 1, j + 1], -1)
+    u, w = (x.reshape(-1, 4) / n for x in quads)
+    patches = []
+    for axis in range(3):
+        for side in (0.0, 1.0):
+            p = np.zeros((len(u), 4, 3))
+            p[..., axis] = side
+            p[..., (axis + 1) % 3], p[..., (axis + 2) % 3] = u, w
+            patches.append(p if side else p[:, ::-1])
+    corners = np.concatenate(patches).reshape(-1, 3)
+    v, index = np.unique(corners.round(9), axis=0, return_inverse=True)
+    quad = index.reshape(-1, 4)
+    f = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+    turn, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
+    turn *= np.linalg.det(turn)
+    assert volume(v @ turn.T, f) == pytest.approx(1.0)
+    w, g = simplified(v @ turn.T, f, 400)
+    assert 60 < len(g) <= 400
+    assert volume(w, g) == pytest.approx(1.0, rel=0.01)  # 0.9 with means of cells
+    back = w[np.unique(g)] @ turn
+    assert np.abs(np.clip(back, 0, 1) - back).max() < 0.01
+    face = np.minimum(np.abs(back), np.abs(1 - back)).min(axis=1)
+    assert face.max() < 0.01
+
+
 def test_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     w, n, _ = shaded(*fine_sphere())
     at = np.abs(w[:, 2]) < 0.9  # not the poles, whose faces are slivers
@@ -165,6 +196,37 @@ def test_a_large_mesh_is_cut_down_and_a_small_one_is_not(model: mujoco.MjModel):
     large = spec.compile()
     assert len(body_meshes(large)[0].triangles) > 30_000
     assert len(body_meshes(large, max_triangles=5000)[0].triangles) <= 5000
+
+
+@pytest.mark.parametrize("deviation", [0.01, 0.005, 0.001])
+def test_faces_are_no_farther_off_than_was_asked_and_no_more_than_that(
+    model: mujoco.MjModel, deviation: float
+):
+    """Of the ball of 0.1 m, around its equator; large shapes have more faces."""
+    spec = mujoco.MjSpec.from_string(SHAPES)
+    for geom in spec.geoms:
+        if geom.name != "sphere":
+            geom.rgba = [1, 1, 1, 0]
+    ball = body_meshes(spec.compile(), deviation=deviation)[-1]
+    middle = ball.vertices[np.abs(ball.vertices[:, 2]) < 1e-9]
+    middle = np.unique(middle.round(9), axis=0)
+    corners = len(middle)
+    inside = 0.1 * (1 - math.cos(math.pi / corners))
+    assert inside <= deviation
+    assert 0.1 * (1 - math.cos(math.pi / (corners - 1))) > deviation
+    sizes = {
+        r: len(body_meshes(balls(r), deviation=deviation)[0].triangles)
+        for r in (0.02, 0.1)
+    }
+    assert sizes[0.02] < sizes[0.1]
+
+
+def balls(radius: float) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(name="b").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0]
+    )
+    return spec.compile()
 
 
 def test_the_built_in_robot_has_a_mesh_for_each_body_that_shows():

@@ -112,10 +112,14 @@ def test_short_gaps_and_touches_are_none(rollout: Rollout):
     force[50:53, 1, 2] = 100.0  # 30 ms with
     force[70:80, 2, 2] = 100.0
     force[90:99, 2, 2] = 100.0  # after 100 ms
+    force[2:9, 3, 2] = 100.0  # all but from the beginning
+    force[0:3, 4, 2] = 100.0  # no longer than that
+    force[8:20, 5, 2] = 100.0  # later
     steady = motion.steadily_loaded(replace(rollout, contact_force=force))
     runs = [viz.runs_of(column) for column in steady.T]
     assert runs[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
-    assert not any(runs[3:])
+    assert runs[3:6] == [[(0, 9)], [(0, 3)], [(8, 20)]]
+    assert not any(runs[6:])
 
 
 def test_poses_are_those_of_the_recorded_states(whole: Path, rollout: Rollout):
@@ -333,8 +337,11 @@ def test_what_is_broken_is_named_and_the_rest_is_shown(
     else:
         file.write_text('{"hello": "world"}')
     record = report.run_record(run)
-    if (name, how) != ("rollout.npz", "gone"):  # then it is a plan with a verdict
-        assert any(m.startswith(name) for m in record["missing"]), record["missing"]
+    named = f"no {name}" if (name, how) == ("rollout.npz", "gone") else name
+    said = [m for m in record["missing"] if m.startswith(named)]
+    assert said, record["missing"]
+    if how != "foreign":
+        assert all("writes it" in m for m in said if name != "timings.json"), said
     assert all("\n" not in m for m in record["missing"])
     shown = {k for k in ("criteria", "keyframes", "motion") if record[k]}
     assert shown == kept

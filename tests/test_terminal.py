@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -242,7 +243,7 @@ MISTAKES = {
     "sweep typo.yaml": ("not disturb.fricton", "there are demo, robot, height"),
     "sweep spec.yaml --workers 0": ("--workers is 0", "expected 1 or more"),
     "sweep spec.yaml --workers 1 --scheduler a:1": ("--workers", "one of them alone"),
-    "--completion fish": ("'fish'", "source <(clamber --completion bash)"),
+    "--completion tcsh": ("'tcsh'", "bash, zsh or fish"),
 }
 
 
@@ -320,18 +321,70 @@ def test_bash_completes_commands_flags_and_values(tmp_path: Path):
         ask clamber cl
         ask clamber climb --hei
         ask clamber export --to ''
+        ask clamber view ru
+        ask clamber report runs/cl
     """
+    (tmp_path / "runs" / "climb").mkdir(parents=True)
     answers = subprocess.run(
-        ["bash", "-c", ask], capture_output=True, text=True, check=True
+        ["bash", "-c", ask], capture_output=True, text=True, check=True, cwd=tmp_path
     ).stdout.splitlines()
     assert answers[0].split() == ["climb"]
     assert answers[1].split() == ["--height"]
     assert set(answers[2].split()) >= {"csv", "mcap", "npz"}
+    assert answers[3:] == ["runs", "runs/climb"]
 
 
 def test_zsh_is_given_a_completion_of_its_own(capsys: pytest.CaptureFixture[str]):
     assert cli.main(["--completion", "zsh"]) == cli.REACHED
     assert capsys.readouterr().out.startswith("#compdef clamber")
+
+
+def test_fish_hands_its_words_to_a_program_that_knows_commands_flags_and_values(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """The program within the script, as fish reads its quoted text."""
+    assert cli.main(["--completion", "fish"]) == cli.REACHED
+    script = capsys.readouterr().out
+    quoted = re.search(r"python3 -c '((?:[^'\\]|\\.)*)' \$words", script, re.S)
+    assert quoted, "no program in quotes"
+    program = re.sub(r"\\([\\'])", r"\1", quoted[1])
+
+    def ask(*words: str) -> list[str]:
+        command = [sys.executable, "-c", program, *words, str(len(words) - 1)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return [line.split("\t")[0] for line in done.stdout.splitlines()]
+
+    assert ask("clamber", "cl") == ["climb"]
+    assert ask("clamber", "climb", "--hei") == ["--height"]
+    assert set(ask("clamber", "export", "--to", "")) >= {"csv", "mcap", "npz"}
+    assert ask("clamber", "view", "ru") == ask("clamber", "climb", "--out", "r")
+    assert ask("clamber", "view", "ru") == [terminal._FILES]
+
+
+def test_fish_completes_commands_flags_values_and_files(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    fish = shutil.which("fish")
+    if fish is None:
+        pytest.skip("no fish here")
+    cli.main(["--completion", "fish"])
+    (tmp_path / "clamber.fish").write_text(capsys.readouterr().out)
+    (tmp_path / "runs" / "climb").mkdir(parents=True)
+
+    def ask(line: str) -> list[str]:
+        done = subprocess.run(
+            [fish, "-c", f"source clamber.fish; complete -C '{line}'"],
+            capture_output=True, text=True, check=True, cwd=tmp_path,
+            env={**os.environ, "HOME": str(tmp_path)},
+        )  # fmt: skip
+        assert done.stderr == ""
+        return [found.split("\t")[0] for found in done.stdout.splitlines()]
+
+    assert ask("clamber cl") == ["climb"]
+    assert ask("clamber climb --hei") == ["--height"]
+    assert set(ask("clamber export run --to ")) >= {"csv", "mcap", "npz"}
+    assert ask("clamber view ru") == ["runs/"]
+    assert ask("clamber report runs/cl") == ["runs/climb/"]
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():

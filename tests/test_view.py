@@ -9,6 +9,7 @@ import socket
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -231,6 +232,13 @@ def test_saving_writes_a_run_of_its_own_and_overwrites_nothing(
     first, second = (edits.save_edited(tmp_path, again) for _ in range(2))
     assert [first.name, second.name] == ["edited", "edited-2"]
     assert {p.name for p in tmp_path.iterdir()} == {"edited", "edited-2"}
+    elsewhere = tmp_path.parent / f"{tmp_path.name}-elsewhere"
+    elsewhere.mkdir()
+    for n, target in ((3, elsewhere), (4, tmp_path / "nowhere")):
+        (tmp_path / f"edited-{n}").symlink_to(target)  # nobody's way out of the folder
+    assert edits.save_edited(tmp_path, again).name == "edited-5"
+    assert not list(elsewhere.iterdir())
+    assert not (tmp_path / "nowhere").exists()
     assert clamber.load_plan(first).complete
     back = clamber.load_sequence(first)
     assert [c.firm for c in back.stances[1].contacts] == [False, False, True]
@@ -323,3 +331,36 @@ def test_a_port_in_use_takes_the_next_one(whole: Path):
         page.close()
     assert page.host == "127.0.0.1"
     assert page.wanted == taken < page.port < taken + 50
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "said", "not_said"),
+    [
+        ("127.0.0.1", 8080, ["ssh -L 8080:127.0.0.1:8080 "], ["in use", "can edit"]),
+        ("127.0.0.1", 8083, ["port 8080 is in use: 8083", "ssh -L 8083"], []),
+        ("0.0.0.0", 8080, [f"http://{socket.gethostname()}:8080; ", "save"], ["ssh"]),
+        ("10.0.0.7", 8080, ["http://10.0.0.7:8080"], ["ssh", "can edit"]),
+    ],
+)
+def test_the_command_says_how_to_get_to_the_page(
+    host: str,
+    port: int,
+    said: list[str],
+    not_said: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    page = SimpleNamespace(
+        host=host, port=port, wanted=8080, missing=[], url=f"http://{host}:{port}"
+    )
+    page.close = lambda: None
+    monkeypatch.setattr("clamber.view.open_view", lambda *_, **__: page)
+
+    def interrupted(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("time.sleep", interrupted)
+    assert cli.main(["view", "climb"]) == 0
+    out = capsys.readouterr().out
+    assert all(text in out for text in said), out
+    assert not any(text in out for text in not_said), out

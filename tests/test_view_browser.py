@@ -296,22 +296,50 @@ def test_each_layer_comes_and_goes(view: Opened):
         )
 
 
-def test_shadows_and_all_faces_are_for_those_who_want_them(view: Opened):
-    """No shadows where a processor draws, unless they are asked for."""
+def test_what_moves_is_drawn_in_time_and_what_rests_finely(view: Opened):
+    """A processor draws shadows, all faces and pixels of what is at rest alone."""
     shadows = """() => { let n = 0; window.__viserMutable.scene.traverse(
       x => n += x.isDirectionalLight && x.castShadow ? 1 : 0); return n }"""
     faces = """name => { let n = 0;
       window.__viserMutable.nodeRefFromName[name].traverse(
         x => n += x.isMesh ? x.geometry.index.count / 3 : 0); return n }"""
-    assert view.tab.evaluate("window.clamberSoft")
-    assert view.tab.evaluate(shadows) == 0
-    few = view.tab.evaluate(faces, view.node("robot"))
-    view.switch("fine shapes", True)
-    view.until(lambda: view.tab.evaluate(shadows) > 0)
-    view.until(lambda: view.tab.evaluate(faces, view.node("robot")) > 3 * few)
-    view.switch("fine shapes", False)
-    view.until(lambda: view.tab.evaluate(shadows) == 0)
-    view.until(lambda: view.tab.evaluate(faces, view.node("robot")) == few)
+    pixels = """[...document.querySelectorAll('canvas')].find(
+      c => c.dataset.engine).width"""
+    robot = view.node("robot")
+    clock, tab = view.page.clock, view.tab
+
+    def drawn(finely: bool) -> bool:
+        return (
+            (tab.evaluate(shadows) > 0) == finely
+            and (tab.evaluate(faces, robot) > 5000) == finely
+            and (tab.evaluate(pixels) > 400) == finely
+        )
+
+    assert tab.evaluate("window.clamberSoft")
+    assert tab.get_by_text("Software WebGL rendering detected").count() == 0
+    view.until(lambda: drawn(True), "fine at rest")
+    clock.toggle()
+    view.until(lambda: drawn(False), "coarse while time plays")
+    clock.toggle()
+    view.until(lambda: drawn(True), "fine after the pause")
+    clock.go(clock.t)  # no other time: nothing moves
+    tab.wait_for_timeout(300)
+    assert drawn(True)
+    tab.mouse.move(150, 200)
+    tab.mouse.down()
+    tab.mouse.move(180, 210, steps=3)
+    view.until(lambda: drawn(False), "coarse while the camera is turned")
+    tab.mouse.move(150, 200, steps=3)
+    tab.mouse.up()
+    view.until(lambda: drawn(True), "fine after that")
+    view.show("Show")
+    view.switch("fine in motion", True)
+    clock.go(0.2 * clock.end)
+    tab.wait_for_timeout(300)
+    assert drawn(True)
+    view.switch("fine in motion", False)
+    clock.go(0.0)
+    view.until(lambda: drawn(False), "coarse in motion again")
 
 
 def test_cameras_go_where_their_names_say(view: Opened):

@@ -175,7 +175,7 @@ def test_the_cursor_stands_where_time_does(ran: Shown):
         text = charts.clock(ran, frame)
         assert f"--clamber-at:{100 * share:.2f}%" in text
         assert f".clamber-s{frame.stance}{{" in text
-        assert f"CoM margin <b>{1000 * frame.margin:.0f} mm</b>" in text
+        assert f"CoM margin</span><b>{1000 * frame.margin:.0f} mm</b>" in text
     late = charts.clock(ran, frame_at(ran, kin, 2 * ran.duration))
     assert "--clamber-at:100.00%" in late
 
@@ -187,7 +187,7 @@ def test_the_clock_names_the_joint_with_the_largest_share(ran: Shown):
     text = charts.clock(ran, frame_at(ran, kin, float(m.time[row])))
     j = int(np.abs(m.effort[row]).argmax())
     share = 100 * abs(float(m.effort[row, j]))
-    assert f"torque <b>{share:.0f} %</b> ({m.world.joints[j]})" in text
+    assert f"torque, {m.world.joints[j]}</span><b>{share:.0f} %</b>" in text
 
 
 def test_a_robot_in_the_air_has_no_margin(ran: Shown):

@@ -40,7 +40,7 @@ from clamber.view.shown import (
     way_at,
     weight_of,
 )
-from clamber.viz import bearing_of
+from clamber.viz import PHASE_COLOURS, bearing_of
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -340,8 +340,31 @@ def test_a_link_that_has_not_moved_is_not_sent(kept: Any, ran: Shown):
     assert [name.count("/") for name in sent] == [2]
 
 
+def test_a_ghost_is_sent_where_it_is_seen_and_what_that_hangs_in(kept: Any, ran: Shown):
+    from clamber.view.stage import Links
+
+    links = Links(kept, "/ghost", ran.world, ran.meshes, ghost=True)
+    frame = frame_at(ran, Kinematics(ran.world), ran.duration / 2)
+    nodes, seen = kept.scene.nodes, np.zeros(len(ran.meshes), dtype=bool)
+    for node in nodes.values():
+        node.__dict__["sent"] = []
+    links.pose(frame.poses, seen)
+    assert not any("position" in n.sent or "wxyz" in n.sent for n in nodes.values())
+    assert not any(n.visible for name, n in nodes.items() if "/mesh/" in name)
+    deepest = max((n for n in nodes if "/mesh" not in n), key=lambda n: n.count("/"))
+    body = int(deepest.split("/")[-1])
+    seen[[m.body for m in ran.meshes].index(body)] = True
+    links.pose(frame.poses, seen)
+    shown = {n.split("/mesh")[0] for n, x in nodes.items() if getattr(x, "visible", 0)}
+    assert shown == {deepest}
+    moved = {n for n, x in nodes.items() if "wxyz" in x.sent or "position" in x.sent}
+    chain = {deepest[:i] for i, c in enumerate(deepest) if c == "/"} | {deepest}
+    assert moved <= chain
+    assert deepest in moved
+
+
 def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
-    from clamber.view.stage import CONE_HEIGHT, cones, discs
+    from clamber.view.stage import CONE_HEIGHT, cones, discs, linear
 
     tilted = np.array([0.0, math.sin(0.3), math.cos(0.3)])
     touches = [
@@ -369,6 +392,10 @@ def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
         mujoco.mju_rotVecQuat(axis, UP, node.batched_wxyzs[i])
         np.testing.assert_allclose(axis, touch.normal, atol=1e-12)
     assert np.all(node.batched_scales[2:] < 1e-3)  # the others are not there
+    dark, mid, light = linear((0, 188, 255))  # mid grey is half of the light
+    assert (dark, mid, light) == (0, 128, 255)
+    for colour, touch in zip(node.batched_colors, touches, strict=False):
+        assert colour.tolist() == linear(PHASE_COLOURS[touch.phase]).tolist()
     discs(kept, "/discs", 4).show(touches)
     flat = kept.scene.nodes["/discs"]
     assert flat.batched_scales[0].tolist() == flat.batched_scales[1].tolist()

@@ -296,6 +296,33 @@ def test_a_backend_that_does_not_work_is_not_chosen(monkeypatch: pytest.MonkeyPa
     viz.gl_backend.cache_clear()
 
 
+@pytest.mark.parametrize(
+    ("name", "drawn"),
+    [
+        ("rollout.npz", {"keyframes.png"}),
+        ("execution.json", {"contacts.png", "stability.png", "keyframes.png"}),
+        ("timings.json", {"contacts.png", "stability.png", "keyframes.png"}),
+    ],
+)
+@pytest.mark.parametrize("cut", [0, 100])
+def test_what_does_without_a_broken_file_is_drawn_before_that_is_named(
+    name: str,
+    drawn: set[str],
+    cut: int,
+    plan: Plan,
+    rollout: Rollout,
+    tmp_path: Path,
+    pictures: None,
+):
+    io.save_plan(plan, tmp_path)
+    io.save_rollout(plan, rollout, tmp_path)
+    io.save_timings(tmp_path, {"plan": 1.0})
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:cut])
+    with pytest.raises(InputError, match=name):
+        viz.render_run(tmp_path, with_video=False)
+    assert drawn <= {p.name for p in tmp_path.glob("*.png")}
+
+
 def test_a_folder_without_a_plan_is_not_drawn(tmp_path: Path):
     with pytest.raises(InputError, match=r"plan\.json: expected a readable file"):
         viz.render_run(tmp_path)

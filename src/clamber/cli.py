@@ -36,10 +36,12 @@ from clamber.terminal import (
     MISSED,
     REACHED,
     READER_GONE,
+    SHELLS,
     Clock,
     Output,
     Report,
     closing,
+    completion,
     conclude,
     keyframe_tables,
     new_table,
@@ -55,7 +57,6 @@ DESCRIPTION = (
     "Turns a recording of a person climbing over an obstacle into a motion that a "
     "humanoid robot executes in physics. Try: clamber climb --video"
 )
-SHELLS = ("bash", "zsh")
 
 
 def _default(module: str, record: str, name: str) -> Any:
@@ -769,6 +770,11 @@ class ViewCommand:
                 f"from another machine: ssh -L {page.port}:127.0.0.1:{page.port}"
                 f" {socket.gethostname()}, then the same address there"
             )
+        elif page.host in ("0.0.0.0", "::"):
+            lines.append(
+                f"from another machine: http://{socket.gethostname()}:{page.port}; "
+                "whoever reaches it can edit and save"
+            )
         record = {"url": page.url, "port": page.port, "missing": page.missing}
         self.output.show(record, note="\n".join(lines))
         sys.stdout.flush()
@@ -1166,10 +1172,15 @@ def _complete(shell: Sequence[str]) -> int:
     """Print the script that makes a shell complete commands, flags and values."""
     if len(shell) != 1 or shell[0] not in SHELLS:
         raise InputError(
-            "bash or zsh, as in: source <(clamber --completion bash)",
+            f"{', '.join(SHELLS[:-1])} or {SHELLS[-1]}, as in: "
+            "source <(clamber --completion bash)",
             source="--completion",
             value=" ".join(shell) or "nothing",
         )
-    with contextlib.suppress(SystemExit):  # the parser's way of having done its work
-        _parse(["--tyro-print-completion", shell[0]])
+    printed = text_io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(printed):
+        # What the parser has for zsh is what fish is made of; it ends when it is done.
+        made = "bash" if shell[0] == "bash" else "zsh"
+        _parse(["--tyro-print-completion", made])
+    sys.stdout.write(completion(shell[0], printed.getvalue()))
     return REACHED

@@ -73,9 +73,12 @@ _MAKERS = {
     PLAN: "plan",
     TRAJECTORY: "plan",
     SCENE: "plan",
+    TIMINGS: "plan",
     ROLLOUT: "simulate",
     EXECUTION: "simulate",
     VERDICT: "simulate",
+    PLANNED_SCENE: "simulate",
+    PLANNED_TRAJECTORY: "simulate",
 }
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
 _OF_AN_EARLIER_PLAN = (
@@ -264,6 +267,8 @@ class _Arrays:
                 self._arrays = {k: f[k] for k in f.files}
         except _UNREADABLE as e:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else e
+            if "pickle" in str(e):  # what numpy takes any other content for
+                reason = "it holds something else"
             raise InputError(
                 f"a whole .npz file ({reason}); {_maker(path)}", source=path
             ) from e
@@ -1092,7 +1097,8 @@ def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
     except (ValueError, KeyError, IndexError) as e:
         reason = " ".join(str(e.args[0] if e.args else e).split())
         raise InputError(
-            f"the robot and the boxes of {PLAN} as MJCF ({reason})", source=path
+            f"the robot and the boxes of {PLAN} as MJCF ({reason}); {_maker(path)}",
+            source=path,
         ) from e
 
 

@@ -2,7 +2,7 @@
 
 The geoms that MuJoCo's viewer shows are tessellated once, in the frame of their body,
 and merged into one mesh a body. Meshes with more triangles than a page can carry are
-simplified by clustering their vertices on a grid.
+simplified by clustering their vertices on a grid [Lindstrom00].
 
 Shapes: N vertices, F triangles.
 """
@@ -16,10 +16,11 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-SLICES = 28  # around a round geom
+SLICES, FEWEST_SLICES = 28, 6  # around a round geom
 SHOWN_GROUPS = (0, 1, 2)  # of geoms, in MuJoCo's viewer
 MAX_TRIANGLES = 60_000  # of all mesh geoms together
 CREASE = math.radians(40.0)  # an edge that turns by more is sharp
+NEAR_MEAN = 1e-2  # how much the vertex of a cell keeps to the middle of those in it
 AROUND = 64  # faces around a vertex that are looked at
 PLAIN = (0.5, 0.5, 0.5, 1.0)  # a geom's colour where it has none: its material's counts
 
@@ -52,14 +53,17 @@ _Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]  # vertices, normals, tri
 
 
 def body_meshes(
-    model: mujoco.MjModel, *, max_triangles: int = MAX_TRIANGLES, slices: int = SLICES
+    model: mujoco.MjModel,
+    *,
+    max_triangles: int = MAX_TRIANGLES,
+    deviation: float = 0.0,
 ) -> list[Mesh]:
     """The visible geoms of each body, tessellated; bodies that show nothing left out.
 
     Args:
         model: Compiled.
         max_triangles: More than these in mesh geoms are simplified.
-        slices: Faces around a round geom.
+        deviation: That faces may be off a round geom [m]: small ones get fewer.
     """
     shown = np.flatnonzero(
         np.isin(model.geom_group, SHOWN_GROUPS)
@@ -74,7 +78,7 @@ def body_meshes(
     keep = min(1.0, max_triangles / max(faces, 1))
     by_body: dict[int, list[tuple[_Triangles, np.ndarray]]] = {}
     for g in shown:
-        part = geom_triangles(model, int(g), keep, slices)
+        part = geom_triangles(model, int(g), keep, _slices(model, int(g), deviation))
         if part is not None:
             colour = geom_colour(model, int(g))[:3]
             by_body.setdefault(int(model.geom_bodyid[g]), []).append((part, colour))
@@ -146,6 +150,17 @@ def geom_triangles(
     mujoco.mju_quat2Mat(R, model.geom_quat[geom])
     R = R.reshape(3, 3)
     return v @ R.T + model.geom_pos[geom], n @ R.T, f
+
+
+def _slices(model: mujoco.MjModel, geom: int, deviation: float) -> int:
+    """Faces around a round geom so that none is farther inside it than that [m]."""
+    size = model.geom_size[geom]
+    long = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_ELLIPSOID
+    radius = float(size.max() if long else size[0])
+    if deviation <= 0.0 or radius <= 0.0:
+        return SLICES
+    half = math.acos(max(0.0, 1.0 - deviation / radius))
+    return min(max(math.ceil(math.pi / half), FEWEST_SLICES), SLICES)
 
 
 def _round(radius: float, half: float, slices: int) -> np.ndarray:
@@ -236,27 +251,44 @@ def shaded(vertices: np.ndarray, triangles: np.ndarray) -> _Triangles:
 def simplified(
     vertices: np.ndarray, triangles: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At most `count` triangles: vertices in one cell of a grid become their mean.
+    """At most `count` triangles: vertices in one cell of a grid become one.
 
-    The grid is coarsened until that holds, at the latest when all is in one cell.
+    It lies where the planes of the triangles around them meet best, by area squared
+    [Lindstrom00], so that flat faces stay flat and edges sharp. The grid is coarsened
+    until the count holds, at the latest when all is in one cell.
     """
     low = vertices.min(axis=0)
-    extent = float((vertices.max(axis=0) - low).max())
+    extent = max(float((vertices.max(axis=0) - low).max()), 1e-9)
     cells = 1 << 10
     while True:
-        cell = np.floor((vertices - low) / max(extent, 1e-9) * cells).astype(int)
-        _, index, size = np.unique(
-            cell, axis=0, return_inverse=True, return_counts=True
-        )
-        index = index.ravel()
-        v = np.zeros((len(size), 3))
-        np.add.at(v, index, vertices)
-        v /= size[:, None]
-        f = _with_area(v, index[triangles])
+        cell = np.floor((vertices - low) / extent * cells).astype(np.int64)
+        key = (cell[:, 0] * (cells + 1) + cell[:, 1]) * (cells + 1) + cell[:, 2]
+        _, index, size = np.unique(key, return_inverse=True, return_counts=True)
+        f = index[triangles]
+        f = f[(f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])]
         if len(f) <= count or cells == 1:
             break
-        cells = max(1, int(cells / 1.4))
-    return v, f
+        # Triangles grow with the square of the cells; the last steps are small.
+        cells = max(1, int(cells / max(1.15, 0.8 * math.sqrt(len(f) / max(count, 1)))))
+    mean = _summed(index, vertices, len(size)) / size[:, None]
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    of, normal = index[triangles].ravel(), np.repeat(area, 3, axis=0)
+    # The planes n^T x = n^T a, about the mean: Q y = r, kept near it by a little of Q.
+    off = np.einsum("ij,ij->i", normal, np.repeat(a, 3, axis=0) - mean[of])
+    Q = _summed(of, (normal[:, :, None] * normal[:, None]).reshape(-1, 9), len(size))
+    Q = Q.reshape(-1, 3, 3)
+    r = _summed(of, normal * off[:, None], len(size))
+    kept = np.trace(Q, axis1=1, axis2=2) * NEAR_MEAN + 1e-300
+    y = np.linalg.solve(Q + kept[:, None, None] * np.eye(3), r[:, :, None])[:, :, 0]
+    far = np.linalg.norm(y, axis=1, keepdims=True) * cells / extent
+    v = mean + y / np.maximum(far, 1.0)
+    return v, _with_area(v, f)
+
+
+def _summed(index: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """(count, k) sums of rows (n, k) with the same index (n,)."""
+    return np.stack([np.bincount(index, x, count) for x in rows.T], axis=1)
 
 
 def _with_area(v: np.ndarray, f: np.ndarray) -> np.ndarray:

@@ -133,8 +133,12 @@ def read_run(folder: Path) -> Run:
     execution = reading.fields(EXECUTION) if ran or reading.has(EXECUTION) else {}
     verdict = reading.fields(VERDICT) if ran or reading.has(VERDICT) else {}
     timings = reading.fields(TIMINGS)
-    if written and not ran and not verdict:
-        reading.missing.append(f"no {ROLLOUT}: the plan has not been run in physics")
+    if written and not ran:
+        if verdict or execution:
+            text = "it has been run in physics; `clamber simulate` writes it anew"
+        else:
+            text = "the plan has not been run in physics"
+        reading.missing.append(f"no {ROLLOUT}: {text}")
     return Run(
         folder=folder,
         written=written,
@@ -451,7 +455,8 @@ def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> np.ndarray:
 def steadily_loaded(rollout: Rollout) -> np.ndarray:
     """(M, nS) bool, the surfaces that bear; gaps, then touches, below 60 ms left out.
 
-    A stiff contact that rolls is without force for a step now and then.
+    A stiff contact that rolls is without force for a step now and then; one in which
+    the run begins, until it has been pressed.
     """
     loaded = loaded_surfaces(rollout.world, rollout)
     last = len(rollout.time) - 1
@@ -459,7 +464,7 @@ def steadily_loaded(rollout: Rollout) -> np.ndarray:
     for column in loaded.T:
         for state in (True, False):
             for a, b in runs_of(column != state):
-                if 0 < a and b <= last and (b - a) * step < SHORTEST_LOAD:
+                if (a > 0 or state) and b <= last and (b - a) * step < SHORTEST_LOAD:
                     column[a:b] = state
     return loaded
 

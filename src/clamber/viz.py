@@ -8,6 +8,7 @@ Shapes: T samples, M recorded states, nS surfaces.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import importlib.util
@@ -31,7 +32,15 @@ from PIL import Image, ImageDraw, ImageFont
 from clamber.contact import Contact, ContactSequence
 from clamber.demo import Demonstration
 from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.io import ROLLOUT, load_plan, load_rollout, trajectory_of, whole_file
+from clamber.io import (
+    ROLLOUT,
+    TIMINGS,
+    TRAJECTORY,
+    load_plan,
+    load_rollout,
+    trajectory_of,
+    whole_file,
+)
 from clamber.model import Kinematics, Robot, World, build_world
 from clamber.pipeline import Plan
 from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
@@ -1026,13 +1035,13 @@ def render_run(
         report: Told of stage, share done and a note.
 
     Raises:
-        InputError: A file of the folder is missing or broken.
+        InputError: A file of the folder is missing or broken; what does without it is
+            drawn by then.
         ClamberError: There is no OpenGL for pictures; the plots are done by then.
     """
     folder = Path(folder)
     tell = report or (lambda stage, share, note: None)
-    plan = load_plan(folder)
-    rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
+    plan, rollout, broken = _readable(folder)
     files: list[Path] = []
     tell("pictures", 0.0, "plots")
     if demonstration is not None:
@@ -1050,7 +1059,30 @@ def render_run(
         tell("pictures", 1.0, "")
         if with_video:
             files.append(video(plan, rollout, folder, report=tell))
+    if broken is not None:
+        raise broken
     return files
+
+
+def _readable(folder: Path) -> tuple[Plan, Rollout | None, InputError | None]:
+    """A plan, a rollout, and why that is not all of a run folder that is broken.
+
+    Raises:
+        InputError: Of the plan.
+    """
+    broken, rollout = None, None
+    try:
+        plan = load_plan(folder)
+    except InputError as e:
+        broken, plan = e, load_plan(folder, without=(TIMINGS, TRAJECTORY))
+    if (folder / ROLLOUT).exists():
+        try:
+            rollout = load_rollout(folder)
+        except InputError as e:
+            broken = broken or e
+            with contextlib.suppress(InputError):
+                rollout = load_rollout(folder, with_events=False)
+    return plan, rollout, broken
 
 
 def render_frame(
@@ -1078,7 +1110,7 @@ def render_frame(
     """
     folder = Path(folder)
     if (folder / ROLLOUT).exists():
-        motion = load_rollout(folder)
+        motion = load_rollout(folder, with_events=False)
         world, t, q = motion.world, motion.time, motion.qpos
     else:
         plan = load_plan(folder)

@@ -63,6 +63,10 @@ STYLE = """<style>
 .clamber p { margin: 2px 0; }
 .clamber .dim { color: var(--dim); } .clamber .bad { color: var(--bad); }
 .clamber .good { color: var(--good); } .clamber .warn { color: var(--warn); }
+.clamber .facts { display: flex; gap: 14px; margin-top: 4px; }
+.clamber .facts p { flex: 1; min-width: 0; white-space: nowrap; }
+.clamber .facts span { display: block; font-size: 11px; overflow: hidden;
+  text-overflow: ellipsis; }
 .clamber b { font-weight: 600; font-variant-numeric: tabular-nums; }
 .clamber table { width: 100%; border-collapse: collapse;
   font-variant-numeric: tabular-nums; }
@@ -72,6 +76,7 @@ STYLE = """<style>
 .clamber [data-t] { cursor: pointer; }
 .clamber tbody[data-t]:hover, .clamber-now { background: var(--soft); }
 .clamber .wide td { vertical-align: top; }
+.clamber .wide td:last-child { white-space: nowrap; }
 .clamber tbody { border-top: 1px solid var(--rule); }
 .clamber .move td { font-weight: 600; padding-top: 4px; text-align: left; }
 .clamber .never { opacity: 0.55; }
@@ -117,22 +122,24 @@ def clock(shown: Shown, frame: Frame) -> str:
     now = f"keyframe {frame.row}" if shown.motion.stills else f"{frame.time:.2f} s"
     facts = []
     if math.isfinite(frame.margin):
-        facts.append(f"CoM margin <b>{1000 * frame.margin:.0f} mm</b>")
+        facts.append(("CoM margin", f"{1000 * frame.margin:.0f} mm"))
     m = shown.motion
     row = row_at(m.time, frame.time)
     if m.effort is not None:
         j = int(np.abs(m.effort[row]).argmax())
         name = escaped(m.world.joints[j])
-        facts.append(f"torque <b>{100 * abs(m.effort[row, j]):.0f} %</b> ({name})")
+        facts.append((f"torque, {name}", f"{100 * abs(m.effort[row, j]):.0f} %"))
     if m.error is not None:
-        facts.append(f"tracking <b>{1000 * m.error[row, 0]:.0f} mrad</b>")
+        facts.append(("tracking", f"{1000 * m.error[row, 0]:.0f} mrad"))
     return (
         f"<style>:root{{--clamber-at:{share:.2f}%}}"
         f".clamber-s{frame.stance}{{background:var(--soft)}}</style>"
         + block(
             f"<p><b>{now}</b> of {shown.duration:.1f} s &middot; "
             f"{escaped(stance['move'])}</p>",
-            f'<p class="dim">{" &middot; ".join(facts)}</p>',
+            '<div class="facts">',
+            *(f"<p><span class=dim>{what}</span><b>{x}</b></p>" for what, x in facts),
+            "</div>",
         )
     )
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import io as text_io
+import math
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -30,16 +32,25 @@ PANEL_WIDTH = 400  # [px]
 ASPECT = 1.2  # of the picture beside the panel
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 SHEET = 0.17  # of the distance that what is seen is moved up, over a panel below
-GROUND, GROUND_SIZE, GROUND_CELL = "/ground", 8.0, 1.0  # [m]
+GROUND, GROUND_SIZE, GROUND_CELL = "/ground", 6.0, 1.0  # [m]
 GROUND_LINE = 0.005  # [m]
 SECTIONS, CELLS = (176, 183, 192), (208, 213, 220)
 DARK_SECTIONS, DARK_CELLS = (74, 80, 88), (46, 50, 56)
 PLAY, PAUSE = "play", "pause"
 BACK, ON = "< contact", "contact >"
 PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
-DARK, FINE = "dark", "fine shapes"
+DARK, FINE = "dark", "fine in motion"
+AT_REST = 0.6  # [s] after which what has not moved is drawn finely
 # What the browser wants is handed to the checkboxes: its own scheme; shadows and all
-# faces, unless a processor draws, which takes longer for them than for all the rest.
+# faces in motion too, unless a processor draws: they take longer than all the rest.
+# Where it does, it draws a quarter of the pixels while something moves: from the start.
+_SET_RESOLUTION = (
+    "const v=window.__viserTestpoints;"
+    "if(window.clamberSoft&&v&&v.devSettings&&v.devSettings.set)"
+    "v.devSettings.set({{fixedDpr:{}}});"
+)
+RESOLUTION = f'<img src="data:," style="display:none" onerror="{_SET_RESOLUTION}">'
+COARSE, ALL_PIXELS = "0.5", "null"
 WISHES = (
     '<img src="data:," style="display:none" onerror="'
     "const g=document.createElement('canvas').getContext('webgl2'),"
@@ -55,14 +66,16 @@ WISHES = (
     "if(wish[l.textContent.trim()]){"
     "let e=l;while(!e.querySelector('input'))e=e.parentElement;"
     "const i=e.querySelector('input');if(!i.checked)i.click()}"
-    '">'
-)
-# Where a processor draws, it draws a quarter of the pixels while time plays.
-RESOLUTION = (
-    '<img src="data:," style="display:none" onerror="'
-    "const v=window.__viserTestpoints;"
-    "if(window.clamberSoft&&v&&v.devSettings&&v.devSettings.set)"
-    'v.devSettings.set({{fixedDpr:{}}})">'
+    + _SET_RESOLUTION.format(COARSE)
+    + "if(window.clamberSoft){this.nextElementSibling.style.display='block';"
+    "for(const n of document.querySelectorAll('.mantine-Notification-root'))"
+    "if(/Software WebGL/.test(n.textContent))n.querySelector('button').click()}"
+    '"><div style="display:none">'
+    + charts.block(
+        '<p class="dim">Drawn without a graphics card: coarsely in motion, with all '
+        "faces and shadows at rest.</p>"
+    )
+    + "</div>"
 )
 
 
@@ -160,6 +173,28 @@ class Clock:
             self.go(self.t + seconds * self.speed)
 
 
+@dataclass(eq=False, slots=True, kw_only=True)
+class _Browser:
+    """What one browser has of its own.
+
+    Attributes:
+        client: It.
+        dark, fine: Its checkboxes.
+        resolution: The element that sets it.
+        lights: Nodes that stand in for those of all.
+        moved: When something moved in it last [s].
+        drawn_finely: It has shadows and all faces at present.
+    """
+
+    client: viser.ClientHandle
+    dark: Any
+    fine: Any
+    resolution: Any
+    lights: list[Any]
+    moved: float
+    drawn_finely: bool = False
+
+
 class Page:
     """What all pages have: ground, cameras, timeline, themes; the server itself."""
 
@@ -186,7 +221,8 @@ class Page:
         self._panel_watchers: list[Callable[[float], None]] = []
         self._panel_next = 0.0
         self._refiners: list[Callable[[viser.ClientHandle, bool], None]] = []
-        self._fine: dict[int, viser.ClientHandle] = {}
+        self._browsers: dict[int, _Browser] = {}
+        self._told = (math.nan, False)
         self._stopped = threading.Event()
         gui, scene = self.server.gui, self.server.scene
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -205,7 +241,6 @@ class Page:
         gui.add_html(charts.STYLE)
         self.head = gui.add_html("")
         self._timeline()
-        self._resolution = gui.add_html("", order=1e10)
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._forget)
         self._player = threading.Thread(target=self._play, daemon=True)
@@ -299,45 +334,78 @@ class Page:
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """What each browser has of its own: theme, shadows and faces."""
-        dark = client.gui.add_checkbox(DARK, False, order=1e9)
-        fine = client.gui.add_checkbox(FINE, False, order=1e9 + 1)
+        own = _Browser(
+            client=client,
+            dark=client.gui.add_checkbox(DARK, False, order=1e9),
+            fine=client.gui.add_checkbox(FINE, False, order=1e9 + 1),
+            resolution=client.gui.add_html("", order=1e9 + 3),
+            lights=[],
+            moved=time.perf_counter(),
+        )
         client.gui.add_html(WISHES, order=1e9 + 2)
         if self._views and client.camera.image_width < client.camera.image_height:
             self.point(client, "corner")
-        own: list[Any] = []
 
-        def light() -> None:
-            """In this browser they stand in for those of all."""
-            while own:
-                own.pop().remove()
-            own.extend(_surroundings(client.scene, dark=dark.value, fine=fine.value))
-
-        @dark.on_update
+        @own.dark.on_update
         def _(_: Any) -> None:
             client.gui.configure_theme(
-                dark_mode=dark.value, show_logo=False, show_share_button=False
+                dark_mode=own.dark.value, show_logo=False, show_share_button=False
             )
             with self.clock.lock:
-                light()
+                _light(own)
 
-        @fine.on_update
+        @own.fine.on_update
+        def _(_: Any) -> None:
+            if own.fine.value:
+                with self.clock.lock:
+                    self._draw(own, True)
+
+        @client.camera.on_update
         def _(_: Any) -> None:
             with self.clock.lock:
-                light()
-                self._fine.pop(client.client_id, None)
-                if fine.value:
-                    self._fine[client.client_id] = client
-                for tell in self._refiners:
-                    tell(client, fine.value)
+                self._moves(own)
+
+        with self.clock.lock:
+            self._browsers[client.client_id] = own
 
     def _forget(self, client: viser.ClientHandle) -> None:
         with self.clock.lock:
-            self._fine.pop(client.client_id, None)
+            self._browsers.pop(client.client_id, None)
+
+    def moves(self) -> None:
+        """Something moves: browsers draw it in time, and finely when it is at rest."""
+        with self.clock.lock:
+            for own in self._browsers.values():
+                self._moves(own)
+
+    def _moves(self, own: _Browser) -> None:
+        own.moved = time.perf_counter()
+        if own.drawn_finely and not own.fine.value:
+            self._draw(own, False)
+
+    def _rests(self) -> None:
+        """Have browsers in which nothing moves any more draw finely."""
+        now = time.perf_counter()
+        with self.clock.lock:
+            for own in self._browsers.values():
+                if not own.drawn_finely and now - own.moved > AT_REST:
+                    self._draw(own, True)
+
+    def _draw(self, own: _Browser, finely: bool) -> None:
+        """With shadows, all faces and pixels, or without."""
+        if own.drawn_finely == finely:
+            return
+        own.drawn_finely = finely
+        with own.client.atomic():
+            own.resolution.content = RESOLUTION.format(ALL_PIXELS if finely else COARSE)
+            _light(own)
+            for tell in self._refiners:
+                tell(own.client, finely)
 
     @property
     def fine(self) -> list[viser.ClientHandle]:
-        """Browsers that draw all faces."""
-        return list(self._fine.values())
+        """Browsers that draw all faces at present."""
+        return [x.client for x in self._browsers.values() if x.drawn_finely]
 
     def on_fine(self, tell: Callable[[viser.ClientHandle, bool], None]) -> None:
         """Have it called when one of them begins or ceases to."""
@@ -374,11 +442,12 @@ class Page:
         """The scene follows each step of the clock, the panel some while it plays."""
         now = time.perf_counter()
         panel = not self.clock.playing or now >= self._panel_next
+        if (t, self.clock.playing) != self._told:
+            self._told = (t, self.clock.playing)
+            self.moves()
         with self.server.atomic():
             for tell in self._watchers:
                 tell(t)
-            scale = "0.5" if self.clock.playing else "null"
-            self._resolution.content = RESOLUTION.format(scale)
             self._buttons.options = (BACK, PAUSE if self.clock.playing else PLAY, ON)
             if panel:
                 self._panel_next = now + PANEL_SECONDS
@@ -394,7 +463,16 @@ class Page:
             now = time.perf_counter()
             if self.server.get_clients():
                 self.clock.advance(min(now - last, 0.25))
+                self._rests()
             last = now
+
+
+def _light(own: _Browser) -> None:
+    """Lights and ground of a browser."""
+    while own.lights:
+        own.lights.pop().remove()
+    dark, fine = own.dark.value, own.drawn_finely
+    own.lights += _surroundings(own.client.scene, dark=dark, fine=fine)
 
 
 def _surroundings(scene: viser.SceneApi, *, dark: bool, fine: bool) -> list[Any]:

@@ -268,6 +268,7 @@ class _Editor:
         if chosen is None:
             return
         index, spell = chosen
+        self._page.moves()
         support = self._made.world.supports[spell.contact.support]
         place = clamped(support, np.array(self._gizmo.position))
         self._edits = replace(self._edits, moved={**self._edits.moved, index: place})

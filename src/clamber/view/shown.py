@@ -41,13 +41,14 @@ from clamber.view.edits import keyframe_steps
 from clamber.viz import FORCE_LENGTH, bearing_of, row_at, support_below
 
 PLAN_STRIDE = 10  # samples of a trajectory between two states that are shown
-ELLIPSE_POINTS = 32
-WAY_POINTS = 16  # of a limb's way
+ELLIPSE_POINTS = 24
+WAY_POINTS = 12  # of a limb's way
 AT_REST = 0.15  # [s] around a keyframe its forces are shown where physics has not run
 ARROW = 2 * FORCE_LENGTH  # [m] of the robot's weight: out of the limb it begins in
 PUSH_SCALE = 2.0  # arrows of pushes are so much longer than those of contact forces
 LEAST_FORCE = 0.005  # [weights] smaller forces are no arrow
-SLICES, MAX_TRIANGLES = 10, 6_000  # of shapes that a processor draws in time
+# Of shapes that a processor draws in time, at a pixel for 4 mm; and of those at rest.
+DEVIATION, MAX_TRIANGLES, FINE_TRIANGLES = 0.005, 6_000, 20_000
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
 STATES = STRIDE * PHYSICS_STEP  # [s] between two recorded states
 MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
@@ -209,9 +210,9 @@ def show_run(
         rollout=rollout,
         motion=motion,
         meshes=tuple(
-            body_meshes(world.model, slices=SLICES, max_triangles=MAX_TRIANGLES)
+            body_meshes(world.model, deviation=DEVIATION, max_triangles=MAX_TRIANGLES)
         ),
-        fine=tuple(body_meshes(world.model)),
+        fine=tuple(body_meshes(world.model, max_triangles=FINE_TRIANGLES)),
         time=time,
         q=q,
         reference=reference,

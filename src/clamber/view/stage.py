@@ -43,8 +43,8 @@ from clamber.viz import PHASE_COLOURS
 GHOST = (59, 130, 246)
 PUSH = (162, 28, 175)
 BALANCE, ELLIPSE, COM = (37, 99, 235), (8, 145, 178), (217, 70, 239)
-WAY, WAY_LINE, WAY_SIDES = (124, 58, 237), 0.004, 8  # radius of the line [m]
-PERSON, PERSON_BOX = (71, 105, 150), (203, 188, 165)
+WAY, WAY_LINE, WAY_SIDES = (124, 58, 237), 0.007, 8  # width of the line [m]
+PERSON, PERSON_BOX = (144, 172, 201), (203, 188, 165)
 BONE, JOINT, HEAD = 0.022, 0.03, 0.1  # [m] radii
 MOST_PARTS = 16  # of a person that are in contact at once
 DISC, DISC_HEIGHT, LIFT = 0.055, 0.004, 0.002  # [m]
@@ -53,7 +53,7 @@ SIDES = 16
 LINE = 0.006  # [m] width of lines
 STILL = 1e-5  # [m], of a quaternion: what moves by less is not sent
 MOST_CORNERS = 16  # of a support polygon that are drawn
-SEE_THROUGH = 0.45  # opacity of the robot around contacts and forces
+SEE_THROUGH = 0.6  # opacity of the robot around contacts and forces
 LINKS_AROUND = 3  # bodies from a contact upwards that its force may lie in
 HIDDEN = 1e-4  # scale of a part of a node that is not there
 RECORDING = "recording"
@@ -67,6 +67,13 @@ LAYERS = {  # name in the page: shown at first
     "way of the limb": True,
     RECORDING: False,
 }
+
+
+def linear(colour: Collection[int]) -> np.ndarray:
+    """(3,) uint8: an sRGB colour as nodes of many parts take theirs."""
+    c = np.array([*colour]) / 255
+    light = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * light).astype(np.uint8)
 
 
 class Links:
@@ -102,6 +109,7 @@ class Links:
         self._meshes: list[list[Any]] = []
         self._fine: dict[int, list[list[Any]]] = {}  # of browsers that have them
         self._clear: frozenset[int] = frozenset()
+        self._shown = np.ones(len(own), dtype=bool)
         for m in own:
             parent = int(world.model.body_parentid[m.body])
             while parent and parent not in index:
@@ -117,6 +125,8 @@ class Links:
 
     def see_through(self, bodies: Collection[int]) -> None:
         """Have these let see what is inside of them and behind, and no others."""
+        if frozenset(bodies) == self._clear:
+            return
         self._clear = frozenset(bodies)
         for meshes in (self._meshes, *self._fine.values()):
             self._tint(meshes)
@@ -148,20 +158,25 @@ class Links:
             poses: (nb, 7) in the world, of all meshes.
             shown: (nb,) bool, which of them are to be seen; all by default.
         """
+        up, wanted = self._parents, np.ones(len(self._rows), dtype=bool)
         if shown is not None:
-            for meshes, on in zip(self._meshes, shown[self._rows], strict=True):
-                for mesh in meshes:
-                    mesh.visible = bool(on)
-            if not shown.any():
+            wanted = shown[self._rows]
+            for i in np.flatnonzero(wanted != self._shown):
+                for mesh in self._meshes[i]:
+                    mesh.visible = bool(wanted[i])
+            self._shown = wanted.copy()
+            for i in range(len(up) - 1, -1, -1):  # what it hangs in is to be right too
+                if wanted[i] and up[i] >= 0:
+                    wanted[up[i]] = True
+            if not wanted.any():
                 return
         p, q = poses[self._rows, :3], poses[self._rows, 3:]
-        up = self._parents
         inverse = quat_conjugate(q[up])
         turned = quat_multiply(inverse, q)
         moved = np.einsum("nij,nj->ni", matrix_from_quat(inverse), p - p[up])
         turned[up < 0], moved[up < 0] = q[up < 0], p[up < 0]
         now = np.concatenate([moved, turned], axis=1)
-        new = np.abs(now - self._sent) > STILL
+        new = (np.abs(now - self._sent) > STILL) & wanted[:, None]
         for i in np.flatnonzero(new[:, :3].any(axis=1)):
             self._nodes[i].position = self._sent[i, :3] = moved[i]
         for i in np.flatnonzero(new[:, 3:].any(axis=1)):
@@ -232,6 +247,15 @@ def _cylinder(radius: float, height: float, top: float) -> tuple[np.ndarray, ...
     return vertices, faces
 
 
+def _round_top(radius: float, height: float) -> tuple[np.ndarray, ...]:
+    """Vertices and triangles of what is seen of a flat disc on z = 0: it from above."""
+    a = np.linspace(0.0, 2 * np.pi, SIDES, endpoint=False)
+    ring = np.stack([radius * np.cos(a), radius * np.sin(a), 0.0 * a + height], axis=1)
+    i = np.arange(SIDES)
+    faces = np.stack([0 * i + SIDES, i, (i + 1) % SIDES], axis=1)
+    return np.concatenate([ring, [[0.0, 0.0, height]]]), faces
+
+
 class Marks:
     """A mark at each of at most `most` contacts, coloured by phase."""
 
@@ -282,14 +306,14 @@ class Marks:
             q[i] = quat_from_matrix(frame_from_normal(touch.normal, [1.0, 0.0, 0.0]))
             wide = touch.friction if self._by_friction else 1.0
             scale[i] = [wide, wide, 1.0]
-            colour[i] = PHASE_COLOURS[touch.phase]
+            colour[i] = linear(PHASE_COLOURS[touch.phase])
         self.node.batched_positions, self.node.batched_wxyzs = p, q
         self.node.batched_scales, self.node.batched_colors = scale, colour
 
 
 def discs(server: viser.ViserServer, name: str, most: int) -> Marks:
     """Contacts."""
-    return Marks(server, name, most, _cylinder(DISC, DISC_HEIGHT, 1.0))
+    return Marks(server, name, most, _round_top(DISC, DISC_HEIGHT))
 
 
 def cones(server: viser.ViserServer, name: str, most: int) -> Marks:
@@ -323,7 +347,7 @@ class Balance:
         self._com = add.add_icosphere(
             f"{name}/com", radius=0.022, subdivisions=1, color=COM
         )
-        vertices, faces = _cylinder(0.018, 0.003, 1.0)
+        vertices, faces = _round_top(0.018, 0.003)
         self._foot = add.add_mesh_simple(
             f"{name}/foot", vertices, faces, color=COM, cast_shadow=False
         )
@@ -412,7 +436,8 @@ class Stage:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            line, sides = tube(way.points, WAY_LINE, 3)
+            steps = np.stack([way.points[:-1], way.points[1:]], axis=1)
+            line, sides = beams(steps, WAY_LINE)
             add.add_mesh_simple(
                 f"{name}/line", line, sides, color=WAY, cast_shadow=False
             )
@@ -471,10 +496,10 @@ class Stage:
             arrow = force_arrow(self._shown.world, touch)
             if arrow is not None:
                 arrows.append(arrow)
-                colours.append(PHASE_COLOURS[touch.phase])
+                colours.append(linear(PHASE_COLOURS[touch.phase]))
         if frame.push is not None:
             arrows.append(frame.push)
-            colours.append(PUSH)
+            colours.append(linear(PUSH))
         self._arrows.visible = bool(arrows) and self._layers["forces"]
         if self._arrows.visible:
             self._arrows.colors = np.array(colours, dtype=np.uint8)
@@ -513,21 +538,23 @@ class Stick:
             np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
             np.zeros((count, 3)),
             batched_scales=np.ones((count, 3)),
-            batched_colors=PERSON,
+            batched_colors=linear(PERSON),
             **common,
         )
         ball, triangles = tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2e-6]]), JOINT)
-        size = np.ones(joints)
-        if "Head" in person.demo.names:
-            size[-1] = HEAD / JOINT
+        self._head = None
+        if "Head" in person.demo.names:  # the last of the joints
+            self._head = add.add_icosphere(
+                f"{root}/head", radius=HEAD, subdivisions=2, color=PERSON
+            )
         self._joints = add.add_batched_meshes_simple(
             f"{root}/joints",
             ball,
             triangles,
             np.tile([1.0, 0.0, 0.0, 0.0], (joints, 1)),
             np.zeros((joints, 3)),
-            batched_scales=size,
-            batched_colors=PERSON,
+            batched_scales=np.ones(joints),
+            batched_colors=linear(PERSON),
             **common,
         )
         self._discs = discs(server, f"{root}/contacts", MOST_PARTS)
@@ -547,4 +574,6 @@ class Stick:
         scale[~figure.seen] = HIDDEN
         self._bones.batched_scales = scale
         self._joints.batched_positions = figure.joints
+        if self._head is not None:
+            self._head.position = figure.joints[-1]
         self._discs.show(figure.touches)

@@ -23,7 +23,11 @@ function el(tag, attributes = {}, ...children) {
 }
 
 const fixed = (x, digits) => (x === null || Number.isNaN(x) ? "–" : x.toFixed(digits));
-const neat = (x) => (typeof x !== "number" ? String(x ?? "–") : Number.isInteger(x) ? String(x) : String(Number(x.toPrecision(4))));
+const neat = (x) => {
+  if (typeof x !== "number") return String(x ?? "–");
+  const short = Number.isInteger(x) ? x : Number(x.toPrecision(4));
+  return short !== 0 && Math.abs(short) < 1e-3 ? short.toExponential() : String(short);
+};
 
 function bytes(text) {
   const raw = atob(text), out = new Uint8Array(raw.length);
@@ -412,14 +416,14 @@ function stances(run) {
 
 function verdict(run) {
   if (!run.criteria) return el("p", { class: "note" }, "Not judged: no verdict.");
-  return table(["criterion", "value", "limit", ""], run.criteria.map((c) => el("tr", { class: c.ok ? "" : "failed" }, cells([c.name, c.value, c.limit, c.ok ? "ok" : "NO"]))));
+  return table(["criterion", "value", "limit", ""], run.criteria.map((c) => el("tr", { class: c.ok ? "" : "failed" }, cells([c.name, c.value, c.limit, c.ok ? "ok" : "NO"]))), "verdict");
 }
 function events(run, motion) {
   if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Nothing out of the ordinary was felt.");
   const time = (t) => (motion && !motion.stills ? t : null);
   return table(["t [s]", "felt on the way"], run.events.map((e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]))), "events");
 }
-const pairs = (title, rows) => rows.length > 0 && [el("h3", {}, title), table(["", ""], rows.map(([k, v]) => el("tr", {}, cells([k, v]))), "pairs")];
+const pairs = (title, rows) => rows.length > 0 && el("div", {}, el("h3", {}, title), table(["", ""], rows.map(([k, v]) => el("tr", {}, cells([k, v]))), "pairs"));
 
 function build() {
   document.body.append(
@@ -433,7 +437,7 @@ function build() {
       section("Verdict", "", verdict),
       section("Events", "", events),
       RUNS.some((r) => r.picture) && section("The person", "", (run) => (run.picture ? el("img", { src: run.picture, alt: "heights of the person's parts over time" }) : el("p", { class: "note" }, "–"))),
-      section("How it was made", "made", (run) => [pairs("Options", run.options), pairs("Versions", run.versions), pairs("Inputs (SHA-256)", run.inputs), pairs("Seconds by stage", run.timings)])),
+      section("How it was made", "made", (run) => el("div", { class: "groups" }, pairs("Options", run.options), pairs("Versions", run.versions), pairs("Seconds by stage", run.timings), pairs("Inputs (SHA-256)", run.inputs)))),
     el("footer", {}, `Written by clamber ${DATA.version}. One file, nothing is fetched.`));
   document.body.classList.toggle("compare", RUNS.length > 1);
   addEventListener("keydown", (e) => {
