@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber import simulation
+from clamber import execution, simulation
 from clamber.adaptation import REACH, Adapted
 from clamber.control import JointLaw
 from clamber.disturbance import Disturbance
@@ -21,6 +21,7 @@ from clamber.execution import (
     EASING,
     FALLBACK,
     FORCE_SMOOTHING,
+    LEANING,
     LOOK,
     LOST,
     MASS_CHANGE,
@@ -639,6 +640,19 @@ def test_a_felt_foot_lies_on_the_ground_as_it_is_turned(pilot, hands_plan):
     assert abs(felt.quaternion @ foot.quaternion) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_a_felt_foot_on_tiptoe_is_on_its_edge(pilot, hands_plan):
+    """It is where its edge is, and need not lie flat there."""
+    foot = next(c for c in hands_plan.keyframes[0].stance if c.surface == "LFoot")
+    q = hands_plan.keyframes[0].q.copy()
+    pilot._kin.update(q)
+    middle = pilot._kin.contact_point("LFoot", np.array([0.0, 0.0, 1.0]), 0)
+    pilot._pose = q.copy()
+    pilot._pose[:3] += [0.01, 0.02, 0.004]
+    felt = pilot._as_felt(replace(foot, edge=0, position=middle))
+    assert felt.edge == 0
+    assert np.allclose(felt.position - middle, [0.01, 0.02, 0.0], atol=1e-4)
+
+
 def test_places_that_were_felt_are_kept_and_renewed(pilot, hands_plan):
     c = placed(pilot, hands_plan, 1)
     feet = [x for x in hands_plan.keyframes[1].stance if x is not c]
@@ -1095,3 +1109,23 @@ def test_what_bears_in_place_of_a_contact_strikes_no_side(pilot, bears):
     # A knee bears in place of no contact: it strikes.
     pilot._load[pilot._surfaces.index("LKnee")] = [2.0 * TOUCH, 0.0, 0.0]
     assert pilot._struck() == ["LKnee"]
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_where_no_way_without_it_is_found_it_may_lean(pilot, found):
+    """Back and forth on the plan at hand would end no lean."""
+    arm = pilot._world.model.geom("RUpperArm").id
+
+    def replan(contacts, loaded):
+        if found:
+            pilot._trajectory = replace(pilot._trajectory)
+        yield
+
+    pilot._replan = replan
+    pilot._lean = Lean(arm, "box", 0.01)
+    exhaust(pilot._withdraw(pilot._i))
+    pilot._weight, pilot._leaning = 300.0, LEANING  # nothing bears it
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(execution, "leaning_part", lambda *_: Lean(arm, "box", 0.01))
+        pilot._leg = len(pilot._legs)
+        assert pilot._leans() == found

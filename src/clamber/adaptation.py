@@ -67,7 +67,7 @@ class Adapted:
 
 
 def felt_contact(kin: Kinematics, c: Contact) -> Contact:
-    """The contact where its surface is in the present posture, lying flat.
+    """The contact where its surface is in the present posture, flat or on its edge.
 
     On the ground, which is known, it is exactly there.
     """
@@ -81,9 +81,7 @@ def felt_contact(kin: Kinematics, c: Contact) -> Contact:
         quaternion = quat_from_matrix(flat)
     if c.support == GROUND:
         p = support.project(p)
-    return replace(
-        c, position=p, quaternion=quaternion, link=quat_from_matrix(R), edge=None
-    )
+    return replace(c, position=p, quaternion=quaternion, link=quat_from_matrix(R))
 
 
 def adapt_plan(

@@ -154,6 +154,8 @@ class Execution:
         self._leaning = 0.0  # [s] so long
         self._wary: dict[tuple[int, str], float] = {}  # see `IK`
         self._lean: Lean | None = None
+        # What leans without there being another way.
+        self._stays: set[tuple[int, str]] = set()
         self._withdrawals = 0
         self._scale = 1.0  # of the torques: mass as felt over mass as described
         self._pose = plan.trajectory.q[0].copy()
@@ -282,7 +284,10 @@ class Execution:
         stance = self._keyframes[self._leg].stance
         actual = {c: self._other(c) or c for c in stance}
         loaded = [x for c, x in actual.items() if c is not made]
+        at_hand = self._trajectory
         yield from self._replan(tuple(actual.values()), loaded)
+        if self._trajectory is at_hand:
+            self._stays.add(key)
 
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
@@ -582,7 +587,10 @@ class Execution:
             self._lean = leaning_part(self._kin, self._load, self._weight)
         else:
             self._lean = striking_part(self._kin, self._struck())
-        if self._lean is not None and self._moves(self._lean.geom):
+        lean = self._lean
+        if lean and (
+            self._moves(lean.geom) or (lean.geom, lean.support) in self._stays
+        ):
             self._lean = None
         return self._lean is not None
 
