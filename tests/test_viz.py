@@ -427,6 +427,15 @@ def test_cameras_look_from_where_their_name_says(camera: viz.Preset, way: list[f
     np.testing.assert_allclose(turned, [-forward[1], forward[0], forward[2]], atol=1e-9)
 
 
+@pytest.mark.parametrize("camera", ["corner", "side", "front", "behind", "top"])
+def test_from_no_side_is_the_ground_white(
+    run: Path, tmp_path: Path, camera: viz.Preset, pictures: None
+):
+    """Its chequers are to be seen."""
+    made = viz.render_frame(run, 1.0, size=SIZE, camera=camera, out=tmp_path / "a.png")
+    assert np.mean(pixels(made).min(axis=2) > 250) < 0.02
+
+
 def test_a_frame_shows_the_state_at_its_time(
     run: Path, rollout: Rollout, tmp_path: Path, pictures: None
 ):

@@ -49,6 +49,7 @@ from clamber.simulation import Rollout
 from clamber.statics import com_margin, projected_distance, support_polygon, theta_max
 
 Preset = Literal["corner", "side", "front", "behind", "top"]
+FROM_ABOVE = -70.0  # [deg] elevation from which the camera's light whitens the ground
 PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation, of a
     # robot that faces along x. From the left and a little behind, the box hides neither
     # the feet on the ground nor the hands on its top.
@@ -276,6 +277,10 @@ class Camera:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             self._scene,
         )
+        if view.elevation < FROM_ABOVE:  # the sun alone lights the ground enough
+            for light in self._scene.lights[: self._scene.nlight]:
+                if light.headlight:
+                    light.diffuse = light.specular = np.zeros(3)
 
     def _drawn(self) -> np.ndarray:
         """(height, width, 3) uint8 of the scene as it was last updated."""
