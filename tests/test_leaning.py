@@ -194,13 +194,13 @@ def test_what_strikes_is_the_geom_nearest_to_a_support(kin):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [20, 42])
+@pytest.mark.parametrize("seed", [144, 42])
 def test_an_arm_that_leans_on_a_tile_is_lifted_off(demo_plan, seed):
-    """Tops warped by 6 cm where the left upper arm comes to lie beside its elbow."""
+    """Tops warped by 6 cm where an upper arm comes to lie beside its elbow."""
     known = {
-        20: Disturbance(
-            unevenness=0.06, friction=0.539115, x=0.027454, y=-0.0351671,
-            yaw=-0.0436208, mass=1.18511, seed=20,
+        144: Disturbance(
+            unevenness=0.06, friction=0.726868, x=0.0491444, y=0.0265243,
+            yaw=-0.113486, mass=1.1864, seed=144,
         ),
         42: Disturbance(
             unevenness=0.06, friction=0.409543, x=-0.0596539, y=-0.0566284,
