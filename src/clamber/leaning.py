@@ -87,12 +87,11 @@ def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | Non
 
 def _moment_of_soles(kin: Kinematics, load: np.ndarray) -> float:
     """The most that forces (nS, 3) turn about the middles of flat surfaces [N m]."""
-    flat = [s.is_flat for s in kin.world.surfaces.values()]
-    half = [
+    half = [  # 0 of a ball
         np.linalg.norm(s.corners - s.centre, axis=1).max()
         for s in kin.world.surfaces.values()
     ]
-    return float(np.maximum(load[flat, 2], 0.0) @ np.array(half)[flat])
+    return float(np.maximum(load[:, 2], 0.0) @ half)
 
 
 def striking_part(kin: Kinematics, surfaces: Collection[str]) -> Lean | None:
