@@ -375,6 +375,38 @@ def test_cycles_without_getting_nearer_are_given_up(robot, monkeypatch):
     assert len(found.paths) == module.PATIENCE + 1
 
 
+def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step(
+    robot, monkeypatch
+):
+    lost = GeneralPolicy(
+        options=(POLICY.options[-1],),
+        over_top=POLICY.over_top,
+        near_edge=POLICY.near_edge,
+        goal=POLICY.goal,
+    )
+    other = replace(POLICY, reach={"LKnee": 0.1})
+    policy = replace(POLICY, secondary=(lost, other))
+    ik = IK(build_world(robot, scene()))
+    key = standing(ik, PlanOptions().keyframe)
+    asked = []
+
+    def manoeuvre(task, key):
+        asked.append(task.policy)
+        if task.policy is policy:
+            return ([(key, None, "ac3")], "") if len(asked) == 1 else ([], "stuck")
+        return ([(key, None, "ac1")], "") if len(asked) < 5 else ([], "stuck too")
+
+    monkeypatch.setattr(module, "_manoeuvre", manoeuvre)
+    found = follow_policy(ik, policy, key, PlanOptions(), changes=9)
+    # The first is asked first again after each; what cannot crawl is not asked at all.
+    assert asked == [policy, policy, other, policy, other]
+    names = [i.option for i in found.iterations]
+    assert names == ["ac3", "ac1, secondary 1"]
+    assert found.instead == "secondary 1 from change 2 on (stuck)"
+    assert found.missed == "stuck"
+    assert not found.arrived
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("lost", ["LKnee", "RElbow"])
 def test_a_limb_that_lost_its_contact_is_set_down_first(crossing, lost):

@@ -110,8 +110,8 @@ class Plan:
         timings: Seconds by stage.
         midway: Where it begins, where that is not the scene's start: the rest of a
             climb, from its first keyframe, which is settled into.
-        instead: Why it makes other contacts than the demonstrated ones, and which;
-            empty where it does not.
+        instead: Why it makes other contacts than the demonstrated ones, and which, or
+            where it followed a secondary policy; empty where it does not.
         policy: That it was planned with; None where it follows a demonstration.
         iterations: Of the policy, one for each path.
     """

@@ -92,6 +92,7 @@ class Followed:
         iterations: One for each path.
         missed: Why it did not get to the goal; empty where it did, or was cut short.
         arrived: It is at the goal.
+        instead: Where a secondary policy was followed, and why; empty: nowhere.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -99,6 +100,7 @@ class Followed:
     iterations: tuple[Iteration, ...]
     missed: str
     arrived: bool
+    instead: str
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -177,17 +179,18 @@ def plan_traverse(
     report = progress or (lambda stage, share, note: None)
     world = build_world(robot, scene)
     ik = IK(world)
-    task = _task(ik, policy, options)
+    tasks = _tasks(ik, policy, options)
     start = standing(ik, options.keyframe)
     check_start(ik, start)
-    _check_route(task)
-    found = _follow(task, start, options.max_changes, report)
+    _check_route(tasks[0])
+    found = _follow(tasks, start, options.max_changes, report)
     report("trajectory", 1.0, "")
     trajectory = timed(world, found.paths, options.speed)
     stances = tuple(Stance(contacts=k.stance) for k in found.keyframes)
     skipped = ()
     if found.missed:
         skipped = (Skipped(stance=len(stances), reason=found.missed, missed=True),)
+    said = (found.missed, found.instead) if found.instead else ()
     return Plan(
         world=world,
         options=options,
@@ -204,6 +207,7 @@ def plan_traverse(
         trajectory=trajectory,
         complete=found.arrived and bool(found.paths),
         timings={},
+        instead="; ".join(filter(None, said)),
         policy=policy,
         iterations=found.iterations,
     )
@@ -216,17 +220,20 @@ def follow_policy(
 
     Args:
         ik: Workspace.
-        policy: The policy.
+        policy: The policy; where it has no stable step, its secondary ones are tried.
         key: Where to go on from.
         options: Of the plan.
         changes: Contact changes at most, then to the end of what was begun.
     """
-    task = _task(ik, policy, options)
-    return _follow(task, key, changes, lambda stage, share, note: None)
+    tasks = _tasks(ik, policy, options)
+    return _follow(tasks, key, changes, lambda stage, share, note: None)
 
 
-def _follow(task: _Task, key: Keyframe, changes: int, report: Progress) -> Followed:
-    keyframes, paths, iterations = [key], [], []
+def _follow(
+    tasks: Sequence[_Task], key: Keyframe, changes: int, report: Progress
+) -> Followed:
+    keyframes, paths, iterations, instead = [key], [], [], []
+    task = tasks[0]
     first = cost_to_go(key.stance, task.goal)
     missed, arrived = "", False
     best, idle = math.inf, 0
@@ -240,11 +247,22 @@ def _follow(task: _Task, key: Keyframe, changes: int, report: Progress) -> Follo
         share = 1.0 - min(to_go / max(first, 1e-9), 1.0)
         report("plan", share, f"{to_go:.2f} m to go, {len(paths)} contact changes")
         made, missed = _manoeuvre(task, keyframes[-1])
+        name = ""
+        for k, other in enumerate(tasks[1:], start=1):
+            if made or not missed:
+                break
+            made, _ = _manoeuvre(other, keyframes[-1])
+            if made:
+                name = f"secondary {k}"
+                instead.append(f"{name} from change {len(paths) + 1} on ({missed})")
         for after, path, option in made:
             keyframes.append(after)
             paths.append(path)
             iterations.append(
-                Iteration(option=option, cost=cost_to_go(after.stance, task.goal))
+                Iteration(
+                    option=f"{option}, {name}" if name else option,
+                    cost=cost_to_go(after.stance, task.goal),
+                )
             )
         if not made:
             arrived = not missed
@@ -259,6 +277,7 @@ def _follow(task: _Task, key: Keyframe, changes: int, report: Progress) -> Follo
         iterations=tuple(iterations),
         missed=missed,
         arrived=arrived,
+        instead="; ".join(instead),
     )
 
 
@@ -989,6 +1008,12 @@ def _turn(yaw: float) -> np.ndarray:
 
 
 # The robot's build, and what cannot be.
+
+
+def _tasks(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> tuple[_Task, ...]:
+    """Of the policy, and of its secondary ones that know how to go on on top."""
+    others = (p for p in policy.secondary if any(o.region == "O" for o in p.options))
+    return tuple(_task(ik, p, options) for p in (policy, *others))
 
 
 def _task(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> _Task:
