@@ -16,6 +16,7 @@ from clamber.adaptation import (
     adapt_plan,
     feeling,
     from_here,
+    go_on,
     start_again,
 )
 from clamber.errors import Status
@@ -370,6 +371,36 @@ def test_where_there_is_no_way_at_the_distance_of_what_is_rough_it_is_not_kept(
     answers = {False: found("no", keys[:2])}
     assert adapt_plan(fast_plan, world.scene, *arguments) is answers[False]
     assert asked == [0.0]
+
+
+def test_a_policy_goes_on_with_what_leans_kept_farther_off_where_that_can_be(
+    fast_plan, monkeypatch
+):
+    world, keys, asked = fast_plan.world, fast_plan.keyframes, []
+    pair = next(set(p) for p in world.pairs if world.support_geom["box"] in p)
+    (leaning,) = pair - {world.support_geom["box"]}
+    wary = {(int(leaning), "box"): 0.03}
+
+    def found(missed, keyframes):
+        return Adapted(world=world, trajectory=None, keyframes=keyframes, missed=missed)
+
+    def stub(plan, ik, made, key, lead):
+        asked.append(bool(ik._wary.any()))
+        return answers[asked[-1]]
+
+    monkeypatch.setattr(adaptation, "_rest", stub)
+    answers = {True: found("", keys), False: found("", keys)}
+    assert go_on(fast_plan, world, keys[-1], wary) is answers[True]
+    assert asked == [True]
+    answers = {True: found("no", keys[:2]), False: found("", keys)}
+    assert go_on(fast_plan, world, keys[-1], wary) is answers[False]
+    assert asked == [True, True, False]
+    answers = {True: found("no", keys[:2]), False: found("no", keys[:2])}
+    assert go_on(fast_plan, world, keys[-1], wary) is answers[True]
+    # Where nothing leans nothing is asked about twice.
+    asked.clear()
+    assert go_on(fast_plan, world, keys[-1]) is answers[False]
+    assert asked == [False]
 
 
 # The whole plan anew.

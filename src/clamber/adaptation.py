@@ -105,9 +105,14 @@ def adapt_plan(
     if found.missed and (wary or any(b.roughness > 0 for b in scene.boxes)):
         smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
         other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NO_WARINESS)
-        if not other.missed or len(other.keyframes) > len(found.keyframes):
-            return other
+        return _farther(found, other)
     return found
+
+
+def _farther(found: Adapted, other: Adapted) -> Adapted:
+    """The other one where it gets farther, and the first misses something."""
+    more = not other.missed or len(other.keyframes) > len(found.keyframes)
+    return other if more else found
 
 
 def _adapt(
@@ -177,9 +182,19 @@ def start_again(plan: Plan, scene: Scene) -> Adapted:
     return _rest(plan, ik, 0, standing(ik, plan.options.keyframe), ())
 
 
-def go_on(plan: Plan, world: World, key: Keyframe) -> Adapted:
-    """A policy followed on from the last keyframe of what was planned ahead."""
-    return _rest(plan, IK(world), 0, key, ())
+def go_on(plan: Plan, world: World, key: Keyframe, wary: Wary = NO_WARINESS) -> Adapted:
+    """A policy followed on from the last keyframe of what was planned ahead.
+
+    Args:
+        plan: Whose policy it is.
+        world: As it is believed to be.
+        key: The last keyframe.
+        wary: As in `adapt_plan`.
+    """
+    found = _rest(plan, IK(world, wary), 0, key, ())
+    if found.missed and wary:
+        return _farther(found, _rest(plan, IK(world), 0, key, ()))
+    return found
 
 
 def _rest(

@@ -292,7 +292,7 @@ class Execution:
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
         key = self._keyframes[-1]
-        found = go_on(self._plan, self._world, key)
+        found = go_on(self._plan, self._world, key, self._wary)
         if found.trajectory is None:
             self._more = False
             if found.missed:
