@@ -33,6 +33,7 @@ SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
 IMPRATIO = 10.0  # friction stiffer than normal force: no creep while standing
 BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
 LOOK_RANGE = 0.12  # [m] to which distances are looked at, to know when to look again
+ROUNDING = 1e-6  # [m] by which squared distances may be wrong, near 0
 FEW_PAIRS = 40  # that are quicker looked at than bounded
 CLEAR = 0.002  # [m] that they keep from boxes at the start
 DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
@@ -830,6 +831,7 @@ class Kinematics:
         self._jacr = np.zeros((3, m.nv))
         self._fromto = np.zeros((len(world.pairs), 6))
         self._fromto_rows = list(self._fromto)
+        self._pairs = world.pairs.tolist()
         self._turn = np.zeros(3)
         # Views of the data: asking for them anew at each use costs more than the use.
         self._xpos = self.data.xpos
@@ -839,15 +841,15 @@ class Kinematics:
         first, second = world.pairs.T
         self._first, self._second = first, second
         radius = m.geom_rbound.copy()
-        self._plane = m.geom_type[first] == mujoco.mjtGeom.mjGEOM_PLANE
-        self._plane2 = m.geom_type[second] == mujoco.mjtGeom.mjGEOM_PLANE
-        self._reach = radius[first] + radius[second]
-        self._plane_any = np.flatnonzero(self._plane | self._plane2)
+        self._planes = np.flatnonzero(m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         box = m.geom_type == mujoco.mjtGeom.mjGEOM_BOX
-        static = m.body_weldid[m.geom_bodyid] == 0
-        self._box_first = np.flatnonzero(box[first] & static[first] & ~self._plane)
-        self._box_second = np.flatnonzero(box[second] & static[second] & ~self._plane2)
-        self._radius = radius
+        self._boxes = np.flatnonzero(box & (m.body_weldid[m.geom_bodyid] == 0))
+        self._radius, self._spheres = radius, radius[:, None] + radius
+        self._size = m.geom_size.copy()
+        self._of_pair = first * m.ngeom + second
+        # No point moves farther by a turn than the radius times its matrix's 2-norm:
+        # the Frobenius norm over the root of two.
+        self._swing = radius / np.sqrt(2.0)
         # What is known of each pair's distance, and where the geoms were then.
         self._least = np.full(len(world.pairs), -np.inf)
         self._seen_x, self._seen_R = np.zeros((m.ngeom, 3)), np.zeros((m.ngeom, 9))
@@ -858,6 +860,8 @@ class Kinematics:
             for b in chain_up(m, body):
                 first = int(m.body_dofadr[b])
                 self._moves[body, first : first + int(m.body_dofnum[b])] = 1.0
+        body = m.geom_bodyid[world.pairs]
+        self._pair_moves = self._moves[body[:, 1]] - self._moves[body[:, 0]]
         # Motion of the dofs about `_root`, as MuJoCo keeps it.
         self._cdof = self.data.cdof
         self._root = self.data.subtree_com[m.body_rootid[world.base]]
@@ -928,7 +932,8 @@ class Kinematics:
     ) -> np.ndarray:
         """(K, 3) the points that bear force on a support with that normal."""
         s = self.world.surface(surface, edge)
-        return self.point(s.body, s.corners) - s.radius * normal
+        p = self.point(s.body, s.corners)
+        return p - s.radius * normal if s.radius else p
 
     def roll(
         self, surface: str, normal: np.ndarray, link: np.ndarray | None
@@ -966,28 +971,27 @@ class Kinematics:
         m, d = self.world.model, self.data
         least = self._least
         least -= self._moved()
-        counts = True if active is None else active
-        idx = np.flatnonzero((least < reach) & counts)
+        idx = self._nearer(reach, active)
         if len(idx) > FEW_PAIRS:
             np.maximum(least, self._gaps(), out=least)
-            idx = np.flatnonzero((least < reach) & counts)
+            idx = self._nearer(reach, active)
         far = max(reach, LOOK_RANGE)
-        look, rows = mujoco.mj_geomDistance, self._fromto_rows
+        look, pairs = mujoco.mj_geomDistance, self._pairs
         distance = np.array(
             [
-                look(m, d, a, b, far, row)
-                for (a, b), row in zip(
-                    self.world.pairs[idx].tolist(), rows, strict=False
-                )
+                look(m, d, *pairs[i], far, row)
+                for i, row in zip(idx.tolist(), self._fromto_rows, strict=False)
             ]
         )
         least[idx] = distance
-        keep = np.flatnonzero(distance < reach)
+        keep = (distance < reach).nonzero()[0]
         distance, idx = distance[keep], idx[keep]
         p = self._fromto[keep]
-        touching = np.abs(distance) < 1e-9
-        normal = (p[:, 3:] - p[:, :3]) / np.where(touching, 1.0, distance)[:, None]
-        for i in np.flatnonzero(touching):
+        apart, touching = distance[:, None], np.abs(distance) < 1e-9
+        if touching.any():
+            apart = np.where(touching, 1.0, distance)[:, None]
+        normal = (p[:, 3:] - p[:, :3]) / apart
+        for i in touching.nonzero()[0]:
             normal[i] = self._touching_normal(idx[i])
         return Proximity(
             pairs=idx,
@@ -997,39 +1001,36 @@ class Kinematics:
             second=p[:, 3:],
         )
 
+    def _nearer(self, reach: float, active: np.ndarray | None) -> np.ndarray:
+        """Indices of the pairs that may be nearer than `reach` [m]."""
+        near = self._least < reach
+        if active is not None:
+            near &= active
+        return near.nonzero()[0]
+
     def _gaps(self) -> np.ndarray:
         """(P,) what bounding spheres, planes and boxes say that is between pairs."""
-        m, x = self.world.model, self._geom_x
-        apart = x[self._first] - x[self._second]
-        gap = np.sqrt(np.einsum("ij,ij->i", apart, apart)) - self._reach
-        k = self._plane_any
-        gap[k] = np.where(
-            self._plane[k],
-            x[self._second[k], 2]
-            - x[self._first[k], 2]
-            - self._radius[self._second[k]],
-            x[self._first[k], 2] - x[self._second[k], 2] - self._radius[self._first[k]],
-        )
-        for k, box, other in (
-            (self._box_first, self._first, self._second),
-            (self._box_second, self._second, self._first),
-        ):
-            if len(k) == 0:
-                continue
-            b, o = box[k], other[k]
-            R = self._geom_R[b].reshape(-1, 3, 3)
-            local = np.einsum("kij,ki->kj", R, x[o] - x[b])
-            outside = np.maximum(np.abs(local) - m.geom_size[b], 0.0)
-            gap[k] = np.sqrt(np.einsum("ij,ij->i", outside, outside)) - self._radius[o]
-        return gap
+        x = self._geom_x - self._root
+        square = np.einsum("ij,ij->i", x, x)
+        gap = square[:, None] + square - 2.0 * (x @ x.T)
+        gap = np.sqrt(np.maximum(gap, 0.0)) - ROUNDING - self._spheres
+        for plane in self._planes:
+            gap[plane] = gap[:, plane] = x[:, 2] - x[plane, 2] - self._radius
+        for box in self._boxes:
+            R = self._geom_R[box].reshape(3, 3)
+            outside = np.abs((x - x[box]) @ R) - self._size[box]
+            outside = np.maximum(outside, 0.0)
+            away = np.sqrt(np.einsum("ij,ij->i", outside, outside)) - self._radius
+            gap[box] = gap[:, box] = away
+        return gap.ravel()[self._of_pair]
 
     def _moved(self) -> np.ndarray:
         """(P,) the most that pairs can have come nearer since this was last asked."""
         x, R = self._geom_x - self._seen_x, self._geom_R - self._seen_R
         shift = np.sqrt(np.einsum("ij,ij->i", x, x))
-        way = shift + self._radius * np.sqrt(np.einsum("ij,ij->i", R, R)) + 1e-9
+        way = shift + self._swing * np.sqrt(np.einsum("ij,ij->i", R, R)) + 1e-9
         self._seen_x[:], self._seen_R[:] = self._geom_x, self._geom_R
-        return way[self._first] + way[self._second]
+        return way.take(self._first) + way.take(self._second)
 
     def distance_jacobian(
         self, pairs: np.ndarray, points: np.ndarray, normals: np.ndarray
@@ -1047,18 +1048,15 @@ class Kinematics:
         wrench = np.empty((len(pairs), 6))
         wrench[:, :3] = _cross(points - self._root, normals)
         wrench[:, 3:] = normals
-        body = self.world.model.geom_bodyid[self.world.pairs[pairs]]
-        return (wrench @ self._cdof.T) * (
-            self._moves[body[:, 1]] - self._moves[body[:, 0]]
-        )
+        return (wrench @ self._cdof.T) * self._pair_moves[pairs]
 
     def _touching_normal(self, pair: int) -> np.ndarray:
         """(3,) from the first geom to the second where their distance is zero."""
         a, b = self._first[pair], self._second[pair]
         x, R = self.data.geom_xpos, self.data.geom_xmat
-        if self._plane[pair]:
+        if a in self._planes:
             return R[a].reshape(3, 3)[:, 2]
-        if self._plane2[pair]:
+        if b in self._planes:
             return -R[b].reshape(3, 3)[:, 2]
         n = x[b] - x[a]
         return n / np.linalg.norm(n)

@@ -20,7 +20,7 @@ Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 
 from clamber.errors import Status
-from clamber.model import Kinematics, Proximity, World
+from clamber.model import Kinematics, Proximity, Surface, World
 from clamber.scene import Support
 from clamber.se3 import frame_from_normal, matrix_from_quat, rotation_vector
 from clamber.statics import (
@@ -55,11 +55,14 @@ FLAT_WEIGHT = 0.3  # of a rolling surface to lie flat all the same
 FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
 ROUGHNESS_WEIGHT = 10.0  # soft task: more distance from what is rough
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
+EDGE_RANGE = 0.15  # [m] ... and have a row where they are nearer to it
 EDGE_ROOM = 0.045  # [m] ... and round ones should, where it costs nothing else
 EDGE_WEIGHT = 3.0
 # How much farther than its clearance a part stays from a support [m], by geom and name.
 Wary = Mapping[tuple[int, str], float]
 NO_WARINESS: Wary = MappingProxyType({})
+# Points in the world with the body that each moves with.
+_Places = Sequence[tuple[int, np.ndarray]]
 SOFT = 8  # daqp's type of a constraint that may give way
 
 
@@ -305,7 +308,9 @@ class IK:
         self._q_max = np.minimum(world.q_max[world.dadr], 1e30)
         self._senses: dict[int, np.ndarray] = {}
         self._violation = 0.0
+        self._fills: list[Callable[[], object]] = []
         self._edges = {n: s.edges() for n, s in world.supports.items()}
+        self._insets = {n: (A, b - EDGE_INSET) for n, (A, b) in self._edges.items()}
         self._rough = np.zeros(len(world.pairs))
         for box in world.scene.boxes:
             of_box = world.pairs == world.support_geom[box.name]
@@ -317,6 +322,8 @@ class IK:
             mine = np.isin(world.pairs, pair).all(axis=1)
             self._rough[mine] = np.maximum(self._rough[mine], more)
             self._wary |= mine
+        self._is_rough = bool(self._rough.any())
+        self._clearance = self._counts = np.zeros(0)
 
     def build(
         self, problem: PostureProblem, q: np.ndarray, reach: float = ACTIVE_RANGE
@@ -328,11 +335,19 @@ class IK:
             q: (nq,).
             reach: Pairs farther apart than this have no row [m].
         """
-        kin, w = self.kin, self.world
-        kin.update(q)
-        soft, hard, ineq = self._soft, self._hard, self._ineq
-        soft.n = hard.n = ineq.n = 0
+        merit = self._errors(problem, q, reach)
+        return self._linearise(problem, q, merit)
+
+    def _errors(self, problem: PostureProblem, q: np.ndarray, reach: float) -> float:
+        """The merit at `q`, and what all rows but their Jacobians hold there.
+
+        A third of the configurations that a solve looks at are judged by it alone: they
+        are taken back, or the last.
+        """
+        self.kin.update(q)
+        self._soft.n = self._hard.n = self._ineq.n = 0
         self._violation = 0.0
+        self._fills.clear()
         for goal in problem.goals:
             self._goal_rows(goal)
         self._direction_rows(problem)
@@ -341,24 +356,34 @@ class IK:
         if problem.lean is not None:
             self._lean_rows(*problem.lean)
         self._balance_rows(problem)
-        if self._rough.any():
+        if self._is_rough:
             self._roughness_rows(problem)
         self._distance_rows(problem.clearance, reach)
-        nv = w.model.nv
+        e = self._soft.lo[: self._soft.n]
+        cost = 0.5 * float(e @ e)
+        weight = problem.posture_weight**2
+        if weight > 0:
+            off = q[self._angles] - problem.q_reference[self._angles]
+            cost += 0.5 * weight * float(off @ off)
+        return cost + 0.5 * PENALTY * self._violation
+
+    def _linearise(self, problem: PostureProblem, q: np.ndarray, merit: float) -> QP:
+        """The QP where `_errors` has just been asked for."""
+        for fill in self._fills:
+            fill()
+        soft, hard, ineq = self._soft, self._hard, self._ineq
+        nv = self.world.model.nv
         J, e = soft.J[: soft.n], soft.lo[: soft.n]
         H = J.T @ J
         c = J.T @ e
-        cost = 0.5 * float(e @ e)
         weight = problem.posture_weight**2
         H.reshape(-1)[:: nv + 1] += DAMPING + weight * self._joints
+        now = q[self._angles]
         if weight > 0:
-            off = q[self._angles] - problem.q_reference[self._angles]
-            c[self._dofs] += weight * off
-            cost += 0.5 * weight * float(off @ off)
+            c[self._dofs] += weight * (now - problem.q_reference[self._angles])
 
         lo, hi = np.empty(nv + ineq.n), np.empty(nv + ineq.n)
         lo[:nv], hi[:nv] = -1e30, 1e30
-        now = q[self._angles]
         lo[self._dofs] = np.minimum(self._q_min - now, 0.0)
         hi[self._dofs] = np.maximum(self._q_max - now, 0.0)
         lo[nv:], hi[nv:] = ineq.lo[: ineq.n], ineq.hi[: ineq.n]
@@ -371,7 +396,7 @@ class IK:
             lo=lo,
             hi=hi,
             sense=self._sense(ineq.n),
-            merit=cost + 0.5 * PENALTY * self._violation,
+            merit=merit,
         )
 
     def _sense(self, rows: int) -> np.ndarray:
@@ -396,9 +421,12 @@ class IK:
         np.maximum(lo[:nv], -step, out=lo[:nv])
         np.minimum(hi[:nv], step, out=hi[:nv])
         heavy = PENALTY * qp.C.T
-        H, c = qp.H + heavy @ qp.C, qp.c - heavy @ np.clip(qp.e, -reach, reach)
+        e = np.minimum(np.maximum(qp.e, -reach), reach)
+        H, c = qp.H + heavy @ qp.C, qp.c - heavy @ e
         x, _, flag, _ = daqp.solve(H, c, qp.A, hi, lo, qp.sense, rho_soft=1.0 / PENALTY)
-        return np.clip(x, lo[:nv], hi[:nv]) if flag > 0 else np.zeros(nv)
+        if flag <= 0:
+            return np.zeros(nv)
+        return np.minimum(np.maximum(x, lo[:nv]), hi[:nv])
 
     def solve(
         self,
@@ -416,11 +444,11 @@ class IK:
         solve begins again without.
         """
         start = self.build(problem, q)
-        n, converged, x, qp = self._descend(
+        n, converged, x, merit = self._descend(
             problem, q, start, iterations, tolerance, leap=True
         )
-        if qp.merit > start.merit:
-            more, converged, x, qp = self._descend(
+        if merit > start.merit:
+            more, converged, x, _ = self._descend(
                 problem, q, start, iterations, tolerance, leap=False
             )
             n += more
@@ -437,28 +465,30 @@ class IK:
         tolerance: float,
         *,
         leap: bool,
-    ) -> tuple[int, bool, np.ndarray, QP]:
-        """Iterations, whether they converged, and where they ended."""
-        n, converged, radius, slow = 0, False, 1.0, 0
+    ) -> tuple[int, bool, np.ndarray, float]:
+        """Iterations, whether they converged, and where they ended, with its merit."""
+        n, converged, radius, slow, merit = 0, False, 1.0, 0, qp.merit
         for n in range(1, iterations + 1):
             dq = self.step(qp, radius)
             size = float(np.abs(dq).max())
             trial = self.kin.integrate(q, dq)
             # The next step will hardly be much longer than this one.
             reach = min(NEAR_RANGE + size, ACTIVE_RANGE)
-            new = self.build(problem, trial, reach)
-            if (leap and n == 1) or new.merit <= qp.merit:
-                gain = qp.merit - new.merit
-                slow = slow + 1 if gain < SLOW * new.merit else 0
+            new = self._errors(problem, trial, reach)
+            if (leap and n == 1) or new <= merit:
+                gain = merit - new
+                slow = slow + 1 if gain < SLOW * new else 0
                 small = size < tolerance and size < 0.9 * radius * STEP_ROTATION
                 converged = small or slow >= 3
-                q, qp = trial, new
+                q, merit = trial, new
+                if not converged and n < iterations:
+                    qp = self._linearise(problem, q, merit)
                 radius = min(2.0 * radius, 1.0)
             else:
                 radius *= 0.25
             if converged or radius < MIN_RADIUS:
                 break
-        return n, converged, q, qp
+        return n, converged, q, merit
 
     def solve_hard(
         self,
@@ -521,7 +551,7 @@ class IK:
                     turn = turn - axis * (turn @ axis)
                 error = max(error, float(np.linalg.norm(turn)))
             contact = max(contact, error)
-        finite = np.isfinite(problem.clearance)
+        finite = self._counted(problem.clearance)
         reach = float(problem.clearance.max(initial=0.02, where=finite))
         near = kin.proximity(reach, finite)
         short = problem.clearance[near.pairs] - near.distance
@@ -547,86 +577,137 @@ class IK:
             com_margin=float(margin),
         )
 
-    # Rows, one method for each kind of task.
+    # Rows, one method for each kind of task. What a row asks for is put down at once; its
+    # Jacobian is left to a function that `_linearise` calls where it is needed.
 
     def _goal_rows(self, g: ContactGoal) -> None:
-        kin = self.kin
         s, support = self.world.surfaces[g.surface], self.world.supports[g.support]
-        n = support.normal
-        p = kin.contact_point(g.surface, n, g.edge)
-        if s.is_flat and g.hard and not g.free and g.edge is None:
-            k = self._hard.take(6).start
-            J, e = self._hard.J, self._hard.lo
-            mujoco.mj_jac(
-                kin.world.model, kin.data, J[k : k + 3], J[k + 3 : k + 6], p, s.body
-            )
-            e[k : k + 3] = g.position - p
-            e[k + 3 : k + 6] = kin.flat_error(g.surface, g.rotation)
-            self._violation += _size(e[k : k + 6])
-            return
-        if not g.hard and not s.is_flat:
-            k = self._soft.take(3).start
-            J = self._soft.J[k : k + 3]
-            kin.point_jacobian(s.body, p + s.radius * n, J)
-            J *= g.reference
-            self._soft.lo[k : k + 3] = g.reference * (p - g.position)
-            return
-        jac, rot = kin.jacobians(s.body, p)
-        if s.radius > 0 and g.link is None:
-            # The touching point stays under the centre: it moves as that does.
-            jac = kin.point_jacobian(s.body, p + s.radius * n)
+        p = self.kin.contact_point(g.surface, support.normal, g.edge)
         if not g.hard:
-            self._target(jac, p - g.position, g.reference)
-            turn = kin.flat_error(g.surface, g.rotation)
-            self._target(rot, -turn, 0.3 * g.reference)
+            self._moving_rows(g, s, p, support.normal)
+        elif g.edge is not None:
+            self._rolling_rows(g, s, p, support.normal)
+        elif g.free:
+            self._free_rows(g, s, p, support)
+        elif s.is_flat:
+            self._flat_rows(g, s, p)
+        else:
+            self._round_rows(g, s, p, support.normal)
+
+    def _moving_rows(
+        self, g: ContactGoal, s: Surface, p: np.ndarray, n: np.ndarray
+    ) -> None:
+        """A surface in the air, on its way."""
+        kin, centre = self.kin, p + s.radius * n
+        k = self._target(p - g.position, g.reference)
+        if not s.is_flat:
+            self._later(
+                lambda: self._aim(k, kin.point_jacobian(s.body, centre), g.reference)
+            )
             return
-        if g.edge is not None:
-            turn = kin.flat_error(g.surface, g.rotation)
-            axis = self._edge_axis(g)
-            across = np.stack([n, np.cross(n, axis)])
-            self._violation += _size(g.position - p) + _size(across @ turn)
-            k = self._hard.take(5)
-            self._hard.J[k.start : k.start + 3] = jac
-            self._hard.lo[k.start : k.start + 3] = g.position - p
-            self._hard.J[k.start + 3 : k.stop] = across @ rot
-            self._hard.lo[k.start + 3 : k.stop] = across @ turn
-            self._target(axis[None] @ rot, -(axis @ turn)[None], FLAT_WEIGHT)
-            return
-        if not g.free:
-            k = self._hard.take(3)
-            self._hard.J[k] = jac
-            self._hard.lo[k] = g.position + kin.roll(g.surface, n, g.link) - p
-            self._violation += _size(self._hard.lo[k])
-            if g.link is not None:
-                centre = kin.point_jacobian(s.body, p + s.radius * n)
-                self._inside(*self._edges[g.support], p, centre)
-            return
-        k = self._hard.take(3 if s.is_flat else 1)
-        self._violation += float(support.height(p)) ** 2
-        self._hard.J[k.start] = n @ jac
-        self._hard.lo[k.start] = -support.height(p)
-        A, b = self._edges[g.support]
+        turn = kin.flat_error(g.surface, g.rotation)
+        turned = self._target(-turn, 0.3 * g.reference)
+
+        def fill() -> None:
+            jac, rot = kin.jacobians(s.body, p)
+            self._aim(k, jac, g.reference)
+            self._aim(turned, rot, 0.3 * g.reference)
+
+        self._later(fill)
+
+    def _flat_rows(self, g: ContactGoal, s: Surface, p: np.ndarray) -> None:
+        """A flat surface in its place."""
+        kin, k = self.kin, self._hard.take(6).start
+        e = self._hard.lo[k : k + 6]
+        e[:3] = g.position - p
+        e[3:] = kin.flat_error(g.surface, g.rotation)
+        self._violation += _size(e)
+
+        def fill() -> None:
+            jac, rot = self._hard.J[k : k + 3], self._hard.J[k + 3 : k + 6]
+            mujoco.mj_jac(kin.world.model, kin.data, jac, rot, p, s.body)
+
+        self._later(fill)
+
+    def _round_rows(
+        self, g: ContactGoal, s: Surface, p: np.ndarray, n: np.ndarray
+    ) -> None:
+        """A round surface in its place, or rolled from there."""
+        kin, k, centre = self.kin, self._hard.take(3), p + s.radius * n
+        e = g.position + kin.roll(g.surface, n, g.link) - p
+        self._hard.lo[k] = e
+        self._violation += _size(e)
+        # One that does not roll touches under its centre: it moves as that does.
+        at = centre if g.link is None else p
+        self._later(lambda: kin.point_jacobian(s.body, at, self._hard.J[k]))
+        if g.link is not None:
+            self._inside(g.support, p, s.body, centre)
+
+    def _rolling_rows(
+        self, g: ContactGoal, s: Surface, p: np.ndarray, n: np.ndarray
+    ) -> None:
+        """A flat surface on one of its edges."""
+        kin, k = self.kin, self._hard.take(5).start
+        turn, axis = kin.flat_error(g.surface, g.rotation), self._edge_axis(g)
+        across = np.stack([n, np.cross(n, axis)])
+        self._hard.lo[k : k + 3] = g.position - p
+        self._hard.lo[k + 3 : k + 5] = across @ turn
+        self._violation += _size(g.position - p) + _size(across @ turn)
+        flat = self._target(-(axis @ turn)[None], FLAT_WEIGHT)
+
+        def fill() -> None:
+            jac, rot = kin.jacobians(s.body, p)
+            self._hard.J[k : k + 3] = jac
+            self._hard.J[k + 3 : k + 5] = across @ rot
+            self._aim(flat, axis[None] @ rot, FLAT_WEIGHT)
+
+        self._later(fill)
+
+    def _free_rows(
+        self, g: ContactGoal, s: Surface, p: np.ndarray, support: Support
+    ) -> None:
+        """A contact wherever it is on its support."""
+        kin, n, T = self.kin, support.normal, support.rotation[:, :2].T
+        k, centre = self._hard.take(3 if s.is_flat else 1), p + s.radius * n
+        height = float(support.height(p))
+        self._hard.lo[k.start] = -height
+        self._violation += height**2
         if s.is_flat:
             turn = kin.flat_error(g.surface, g.rotation)
-            R = support.rotation
-            self._violation += _size(R[:, :2].T @ turn)
-            self._hard.J[k.start + 1 : k.stop] = R[:, :2].T @ rot
-            self._hard.lo[k.start + 1 : k.stop] = R[:, :2].T @ turn
-            self._target(n[None] @ rot, -(n @ turn)[None], 0.3)
+            self._hard.lo[k.start + 1 : k.stop] = T @ turn
+            self._violation += _size(T @ turn)
+            aside, weight = n[None], 0.3
+            soft = self._target(-(n @ turn)[None], weight)
             for corner in kin.bearing_points(g.surface, n):
-                self._inside(A, b, corner, kin.point_jacobian(s.body, corner))
-            jac = kin.point_jacobian(s.body, p)
+                self._inside(g.support, corner, s.body, corner)
         else:
-            self._inside(A, b, p, jac)
-            self._keep_from_edges(A, b, p, jac)
-        T = support.rotation[:, :2].T
+            self._inside(g.support, p, s.body, centre)
+            # As a task, room to slip before it is over the border.
+            A, b = self._edges[g.support]
+            room = b - EDGE_ROOM - A @ p
+            aside, weight = A[room < 0.0], EDGE_WEIGHT
+            soft = self._target(-room[room < 0.0], weight)
+        wanted = under = None
         if g.reference > 0:
-            self._target(T @ jac, T @ (p - g.position), g.reference)
+            wanted = self._target(T @ (p - g.position), g.reference)
+        body, mass = kin.landmark(self.world.robot.limb_of(g.surface).root)
+        stability = np.sqrt(2.0 * g.stability)
         if g.stability > 0:
-            body, mass = kin.landmark(self.world.robot.limb_of(g.surface).root)
-            J = jac.copy()
-            J -= kin.point_jacobian(body, mass)
-            self._target(J[:2], (p - mass)[:2], np.sqrt(2.0 * g.stability))
+            under = self._target((p - mass)[:2], stability)
+
+        def fill() -> None:
+            jac, rot = kin.jacobians(s.body, centre)
+            self._hard.J[k.start] = n @ jac
+            if s.is_flat:
+                self._hard.J[k.start + 1 : k.stop] = T @ rot
+            self._aim(soft, aside @ (rot if s.is_flat else jac), weight)
+            if wanted is not None:
+                self._aim(wanted, T @ jac, g.reference)
+            if under is not None:
+                kin.point_jacobian(body, mass, self._jac)
+                self._aim(under, jac[:2] - self._jac[:2], stability)
+
+        self._later(fill)
 
     def _edge_axis(self, g: ContactGoal) -> np.ndarray:
         """(3,) unit vector along the edge, where the surface lay flat."""
@@ -636,70 +717,90 @@ class IK:
         return along / np.linalg.norm(along)
 
     def _inside(
-        self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray
+        self, support: str, p: np.ndarray, body: int, moves: np.ndarray
     ) -> None:
-        room = b - EDGE_INSET - A @ p
-        near = room < 0.15
-        if not near.any():
+        """Keep `p` on its support; it moves as the body's point at `moves` does."""
+        A, b = self._insets[support]
+        room = b - A @ p
+        least = room.min()
+        if least >= EDGE_RANGE:
             return
-        self._violation += _size(np.minimum(room[near], 0.0))
-        k = self._ineq.take(int(near.sum()))
-        self._ineq.J[k] = A[near] @ jac
+        if least < 0.0:
+            self._violation += _size(np.minimum(room[room < EDGE_RANGE], 0.0))
+        near = room < EDGE_RANGE
+        k = self._ineq.take(int(np.count_nonzero(near)))
         self._ineq.hi[k] = room[near]
         self._ineq.lo[k] = -1e30
 
-    def _keep_from_edges(
-        self, A: np.ndarray, b: np.ndarray, p: np.ndarray, jac: np.ndarray
-    ) -> None:
-        """As a task, room to slip before a round surface is over the border."""
-        room = b - EDGE_ROOM - A @ p
-        near = room < 0.0
-        if near.any():
-            self._target(A[near] @ jac, -room[near], EDGE_WEIGHT)
+        def fill() -> None:
+            self._ineq.J[k] = A[near] @ self.kin.point_jacobian(body, moves)
 
-    def _target(self, J: np.ndarray, e: np.ndarray, weight: float) -> None:
+        self._later(fill)
+
+    def _later(self, fill: Callable[[], object]) -> None:
+        self._fills.append(fill)
+
+    def _target(self, e: np.ndarray, weight: float) -> slice:
+        """Rows of a soft task, `_aim` gives them their Jacobian."""
         k = self._soft.take(len(e))
-        np.multiply(J, weight, out=self._soft.J[k])
         np.multiply(e, weight, out=self._soft.lo[k])
+        return k
+
+    def _aim(self, k: slice, J: np.ndarray, weight: float) -> None:
+        np.multiply(J, weight, out=self._soft.J[k])
 
     def _base_rows(self, R_WB: np.ndarray, weight: float) -> None:
-        w = self.world
-        _, rot = self.kin.jacobians(w.base, self.kin.data.xpos[w.base])
-        self._target(rot, -rotation_vector(R_WB @ self.kin.rotation(w.base).T), weight)
+        kin, base = self.kin, self.world.base
+        k = self._target(-rotation_vector(R_WB @ kin.rotation(base).T), weight)
+        at = kin.data.xpos[base]
+        self._later(lambda: self._aim(k, kin.jacobians(base, at)[1], weight))
 
     def _direction_rows(self, problem: PostureProblem) -> None:
         if problem.direction_weight <= 0:
             return
-        kin = self.kin
-        limbs = self.world.robot.limbs
+        limbs, landmark = self.world.robot.limbs, self.kin.landmark
         for name, u in problem.directions.items():
             if name == "trunk":
-                a = self._middle("left_leg", "right_leg", self._jac2)
-                b = self._middle("left_arm", "right_arm", self._jac)
+                start = [landmark(limbs[x].root) for x in ("left_leg", "right_leg")]
+                end = [landmark(limbs[x].root) for x in ("left_arm", "right_arm")]
             else:
                 limb, first, second = _SEGMENTS[name]
-                body, a = kin.landmark(getattr(limbs[limb], first))
-                kin.point_jacobian(body, a, self._jac2)
-                body, b = kin.landmark(getattr(limbs[limb], second))
-                kin.point_jacobian(body, b, self._jac)
-            length = float(np.linalg.norm(b - a))
-            self._target(
-                (self._jac - self._jac2) / length,
-                (b - a) / length - u,
-                problem.direction_weight,
-            )
+                start = [landmark(getattr(limbs[limb], first))]
+                end = [landmark(getattr(limbs[limb], second))]
+            self._segment_rows(start, end, u, problem.direction_weight)
 
-    def _middle(self, left: str, right: str, jac: np.ndarray) -> np.ndarray:
-        """(3,) midway between two limbs' roots; `jac` (3, nv) receives its Jacobian.
+    def _segment_rows(
+        self, start: _Places, end: _Places, direction: np.ndarray, weight: float
+    ) -> None:
+        """From the middle of some places to that of others, in a direction (3,)."""
+        a, b = _middle(start), _middle(end)
+        length = float(np.linalg.norm(b - a))
+        k = self._target((b - a) / length - direction, weight)
 
-        Each root moves with its own body: where one arm turns, the middle stays.
+        def fill() -> None:
+            J = self._middle_jacobian(end, self._jac)
+            J -= self._middle_jacobian(start, self._jac2)
+            self._aim(k, J / length, weight)
+
+        self._later(fill)
+
+    def _middle_jacobian(self, places: _Places, out: np.ndarray) -> np.ndarray:
+        """(3, nv) each place moves with its own body: where one turns, the middle may
+        stay.
         """
-        a, p = self.kin.landmark(self.world.robot.limbs[left].root)
-        b, q = self.kin.landmark(self.world.robot.limbs[right].root)
-        self.kin.point_jacobian(a, p, jac)
-        jac += self.kin.point_jacobian(b, q)
-        jac *= 0.5
-        return 0.5 * (p + q)
+        (body, p), *more = places
+        self.kin.point_jacobian(body, p, out)
+        for body, p in more:
+            out += self.kin.point_jacobian(body, p)
+        if more:
+            out *= 1.0 / len(places)
+        return out
+
+    def _lean_rows(self, surface: str, direction: np.ndarray, weight: float) -> None:
+        s = self.world.surfaces[surface]
+        start = [(s.body, self.kin.point(s.body, s.centre))]
+        end = [self.kin.landmark(self.world.robot.limb_of(surface).root)]
+        self._segment_rows(start, end, direction, weight)
 
     def _bearing(
         self, problem: PostureProblem
@@ -758,59 +859,61 @@ class IK:
                     rows[i] -= (share * A[i]) @ move
 
     def _balance_rows(self, problem: PostureProblem) -> None:
-        com = self.kin.com[:2].copy()
-        if problem.com_target is not None and problem.com_weight > 0:
-            J = self.kin.com_jacobian()[:2]
-            self._target(J, com - problem.com_target, problem.com_weight)
+        kin, com = self.kin, self.kin.com[:2].copy()
+        target, weight = problem.com_target, problem.com_weight
+        if target is not None and weight > 0:
+            aimed = self._target(com - target, weight)
+            self._later(lambda: self._aim(aimed, kin.com_jacobian()[:2], weight))
         if not problem.balance:
             return
         movers, points = self._bearing(problem)
         if not movers:
             return
         polygon = support_polygon(points[:, :2])
-        J = self.kin.com_jacobian()[:2].copy()
         A, b = polygon_halfplanes(polygon)
         room = b - problem.balance_margin - A @ com
         self._violation += _size(np.minimum(room, 0.0))
         k = self._ineq.take(len(b))
-        self._ineq.J[k] = A @ J
-        if len(polygon) == len(b) and any(movers):
-            self._polygon_motion(A, polygon, com, movers, points, self._ineq.J[k])
         self._ineq.hi[k] = room
         self._ineq.lo[k] = -1e30
-        if problem.com_target is None and problem.com_weight > 0:
-            self._target(J, com - polygon.mean(axis=0), problem.com_weight)
+        middle = drawn = None
+        if target is None and weight > 0:
+            middle = self._target(com - polygon.mean(axis=0), weight)
+        excess, gradient = 0.0, com
         if problem.ellipse_weight > 0:
             excess, gradient = support_ellipse(polygon).excess(com)
-            if excess > 0:
-                self._target(
-                    (gradient @ J)[None], np.array([excess]), problem.ellipse_weight
-                )
+        if excess > 0:
+            drawn = self._target(np.array([excess]), problem.ellipse_weight)
 
-    def _lean_rows(self, surface: str, direction: np.ndarray, weight: float) -> None:
-        kin = self.kin
-        s = self.world.surfaces[surface]
-        a = kin.point(s.body, s.centre)
-        body, b = kin.landmark(self.world.robot.limb_of(surface).root)
-        length = float(np.linalg.norm(b - a))
-        kin.point_jacobian(body, b, self._jac)
-        kin.point_jacobian(s.body, a, self._jac2)
-        self._target(
-            (self._jac - self._jac2) / length, (b - a) / length - direction, weight
-        )
+        def fill() -> None:
+            J = kin.com_jacobian()[:2]
+            self._ineq.J[k] = A @ J
+            if middle is not None:
+                self._aim(middle, J, weight)
+            if drawn is not None:
+                self._aim(drawn, (gradient @ J)[None], problem.ellipse_weight)
+            if len(polygon) == len(b) and any(movers):
+                rows = self._ineq.J[k]
+                self._polygon_motion(A, polygon, com, movers, points, rows)
+
+        self._later(fill)
 
     def _distance_rows(self, clearance: np.ndarray, reach: float) -> None:
-        counts = np.isfinite(clearance)
-        if not counts.any():
-            return
-        near = self.kin.proximity(reach, counts)
+        near = self.kin.proximity(reach, self._counted(clearance))
         if len(near.pairs) == 0:
             return
-        k = self._pair_rows(self._ineq, near)
         short = clearance[near.pairs] - near.distance
         self._violation += _size(np.maximum(short, 0.0))
+        k = self._ineq.take(len(short))
         self._ineq.lo[k] = short
         self._ineq.hi[k] = 1e30
+        self._later(lambda: self._pair_jacobian(near, self._ineq.J[k]))
+
+    def _counted(self, clearance: np.ndarray) -> np.ndarray:
+        """(P,) bool: pairs that count; the same array for the same clearances."""
+        if clearance is not self._clearance:
+            self._clearance, self._counts = clearance, np.isfinite(clearance)
+        return self._counts
 
     def _roughness_rows(self, problem: PostureProblem) -> None:
         """Keep farther from what is rough, as a task for each pair that is too near.
@@ -819,7 +922,7 @@ class IK:
         what is known to have touched.
         """
         w = self.world
-        counts = np.isfinite(problem.clearance) & (self._rough > 0)
+        counts = self._counted(problem.clearance) & (self._rough > 0)
         for g in problem.goals:
             if g.hard:
                 of_link = self._geom_body[w.pairs] == w.surfaces[g.surface].body
@@ -830,16 +933,20 @@ class IK:
         short = np.maximum(wanted[near.pairs] - near.distance, 0.0)
         if not short.any():
             return
-        k = self._pair_rows(self._soft, near)
-        self._soft.J[k] *= ROUGHNESS_WEIGHT
-        self._soft.J[k][short == 0.0] = 0.0
+        k = self._soft.take(len(short))
         self._soft.lo[k] = -ROUGHNESS_WEIGHT * short
 
-    def _pair_rows(self, rows: _Rows, near: Proximity) -> slice:
-        """Rows whose Jacobian is that of the pairs' distances."""
-        k = rows.take(len(near.pairs))
-        rows.J[k] = self.kin.distance_jacobian(near.pairs, near.first, near.normal)
-        return k
+        def fill() -> None:
+            J = self._pair_jacobian(near, self._soft.J[k])
+            J *= ROUGHNESS_WEIGHT
+            J[short == 0.0] = 0.0
+
+        self._later(fill)
+
+    def _pair_jacobian(self, near: Proximity, out: np.ndarray) -> np.ndarray:
+        """(m, nv) of the pairs' distances."""
+        out[:] = self.kin.distance_jacobian(near.pairs, near.first, near.normal)
+        return out
 
 
 def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
@@ -848,6 +955,12 @@ def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
     if np.array_equal(indices, np.arange(first, first + len(indices))):
         return slice(first, first + len(indices))
     return indices
+
+
+def _middle(places: _Places) -> np.ndarray:
+    """(3,) of one place, or midway between two."""
+    points = [p for _, p in places]
+    return points[0] if len(points) == 1 else 0.5 * (points[0] + points[1])
 
 
 def _size(e: np.ndarray) -> float:
