@@ -10,8 +10,10 @@ Each is planned; those that are stable come first, by the least of
 
     sum over the contacts that are made of (way of the surface to it + d)
 
-with d the projected distance (4.17) of the new contact. Where none is stable, contacts
-are searched for (`exploration`). The rest of a climb is planned from its middle in the
+with d the projected distance (4.17) of the new contact. Where none is stable, elbows
+stand in for hands (`stand_ins`): no wrist has to bear. Where that is not stable either,
+contacts are searched for (`exploration`), from where the alternative that came farthest
+is stuck, then from the start. The rest of a climb is planned from its middle in the
 same order: as it was, with other surfaces, by the search.
 """
 
@@ -30,6 +32,7 @@ from clamber.exploration import (
     Bounds,
     Counts,
     Explored,
+    Reached,
     action_counts,
     explore,
 )
@@ -46,11 +49,10 @@ from clamber.pipeline import (
     timed,
 )
 from clamber.posture.ik import IK
-from clamber.posture.keyframe import Keyframe
 from clamber.scaling import retarget
-from clamber.scene import Scene
+from clamber.scene import GROUND, Scene
 from clamber.se3 import quat_from_matrix
-from clamber.search import Found, standing
+from clamber.search import Found, plan_steps, standing
 from clamber.statics import projected_distance
 
 TOUCHING = 0.005  # [m] a surface that is nearer to a support is in contact
@@ -143,6 +145,62 @@ def contact_alternatives(
             Alternative(surfaces=chosen, sequence=without_surfaces(sequence, dropped))
         )
     return tuple(out)
+
+
+def stand_ins(sequence: ContactSequence, robot: Robot) -> tuple[Alternative, ...]:
+    """One for each set of arms that use their next surface in place of the first.
+
+    Of arms that touch obstacles with the first one alone, a hand: where an elbow takes
+    its place, fewer joints and shorter levers bear. The most arms come first.
+
+    Args:
+        sequence: As demonstrated.
+        robot: Whose arms they are.
+    """
+    used = {c.surface for s in sequence.stances for c in s.contacts}
+    on_top = {
+        c.surface for s in sequence.stances for c in s.contacts if c.support != GROUND
+    }
+    pairs = [
+        limb.surfaces[:2]
+        for limb in robot.limbs.values()
+        if limb.is_arm
+        and len(limb.surfaces) > 1
+        and limb.surfaces[0] in on_top
+        and used.isdisjoint(limb.surfaces[1:])
+    ]
+    out = []
+    for n in range(len(pairs), 0, -1):
+        for chosen in itertools.combinations(pairs, n):
+            changed = dict(chosen)
+            kept = tuple(a for a, _ in pairs if a not in changed)
+            out.append(
+                Alternative(
+                    surfaces=(*kept, *changed.values()),
+                    sequence=_with_surfaces(sequence, changed),
+                )
+            )
+    return tuple(out)
+
+
+def _with_surfaces(
+    sequence: ContactSequence, changed: Mapping[str, str]
+) -> ContactSequence:
+    """The sequence with other surfaces at the same places, by those they replace."""
+    return replace(
+        sequence,
+        stances=tuple(
+            replace(
+                s,
+                contacts=tuple(
+                    replace(c, surface=changed.get(c.surface, c.surface))
+                    for c in s.contacts
+                ),
+            )
+            for s in sequence.stances
+        ),
+        intervals=(),
+    )
 
 
 def without_surfaces(
@@ -279,8 +337,19 @@ def _replanned(
     explored = None
     if not ranked[0].stable:
         ik = IK(build_world(robot, scene))
+        for a in stand_ins(sequence, robot):
+            report("replan", 1.0, ", ".join(a.surfaces))
+            planned.append((a, _planned_once(ik, a.sequence, options)))
+            if planned[-1][1].complete:
+                break
+        ranked = _ranked(planned)
+    if not ranked[0].stable:
         goal = retarget(sequence, ik.world)
-        explored = _explored(ik, goal, options, bounds, counts, None, report)
+        stuck = max((_reached(r.plan) for r in ranked), key=lambda x: len(x.steps))
+        for start in (stuck, None) if stuck.steps else (None,):
+            explored = _explored(ik, goal, options, bounds, counts, start, report)
+            if explored is None or explored.sequence is not None:
+                break
         if explored is not None and explored.sequence is not None:
             made = _plan_of(ik.world, options, explored.sequence, explored)
             names = _surfaces(explored)
@@ -288,6 +357,38 @@ def _replanned(
             ranked = (*_ranked([(found, made)]), *ranked)
     return Replanned(
         differences=contact_differences(sequence), ranked=ranked, explored=explored
+    )
+
+
+def _planned_once(ik: IK, sequence: ContactSequence, options: PlanOptions) -> Plan:
+    """The plan of a sequence with these weights and no others."""
+    goal = retarget(sequence, ik.world)
+    steps, skipped = split_moves(goal, ik.world)
+    found = plan_steps(
+        ik,
+        steps,
+        options.method,
+        options.keyframe,
+        lap=lambda stage: None,
+        report=_silent,
+    )
+    made = _plan_of(ik.world, options, goal, found)
+    return replace(made, skipped=(*skipped, *made.skipped))
+
+
+def _reached(made: Plan) -> Reached:
+    """What a plan does before the first step that it misses."""
+    steps: list[Step] = []
+    for path, step in zip(
+        made.paths, split_moves(made.sequence, made.world)[0], strict=False
+    ):
+        move = path.transition.move
+        if move.limb != step.move.limb or _made(move.makes) != _made(step.move.makes):
+            break
+        steps.append(replace(step, move=move))
+    n = len(steps)
+    return Reached(
+        keyframes=made.keyframes[: n + 1], paths=made.paths[:n], steps=tuple(steps)
     )
 
 
@@ -307,7 +408,7 @@ def _explored(
     options: PlanOptions,
     bounds: Bounds | None,
     counts: Counts | None,
-    start: Keyframe | None,
+    start: Reached | None,
     report: Progress,
 ) -> Explored | None:
     """What the search finds; None where it is not wanted."""
@@ -471,7 +572,8 @@ def replan_rest(
         return replace(
             ranked[0].plan, instead=f"{why}; instead, of the alternatives: {used}"
         )
-    explored = _explored(ik, sequence, options, bounds, counts, start, report)
+    here = Reached(keyframes=(start,))
+    explored = _explored(ik, sequence, options, bounds, counts, here, report)
     tried = described(Replanned(differences=(), ranked=ranked, explored=explored))
     if explored is None or explored.sequence is None:
         return replace(first, instead=f"{why}; {tried}")

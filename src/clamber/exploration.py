@@ -73,7 +73,7 @@ class Bounds:
     Attributes:
         tries: Steps that it plans at most; 0: none, there is no search. A step takes
             from a tenth of a second to two seconds.
-        depth: Moves of a sequence at most.
+        depth: Moves that it adds at most.
     """
 
     tries: int = 100
@@ -96,8 +96,8 @@ class Explored:
     """What a search for contacts found.
 
     Attributes:
-        keyframes: The start first; one more for each path. Where nothing was found, the
-            start alone.
+        keyframes: The start first; one more for each path. Where nothing was found,
+            those that it went on from.
         paths: Between them.
         sequence: Of the stances found, a robot's own; None where nothing was found.
         states: That were expanded.
@@ -140,8 +140,14 @@ def action_counts(sequence: ContactSequence, world: World) -> Counts:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _State:
-    """A stance that is reached, and how."""
+class Reached:
+    """A stance that is reached, and how.
+
+    Attributes:
+        keyframes: The start first; one more for each path.
+        paths: Between them; steps: that they make.
+        cost: Of the actions.
+    """
 
     keyframes: tuple[Keyframe, ...]
     paths: tuple[Path, ...] = ()
@@ -159,7 +165,7 @@ class _Action:
 class _Entry:
     priority: float
     order: int
-    state: _State = field(compare=False)
+    state: Reached = field(compare=False)
     action: _Action = field(compare=False)
 
 
@@ -170,7 +176,7 @@ def explore(
     counts: Counts,
     bounds: Bounds,
     *,
-    start: Keyframe | None = None,
+    start: Reached | None = None,
     report: Progress = lambda stage, share, note: None,
 ) -> Explored:
     """Search for contacts that lead to where a sequence ends.
@@ -183,31 +189,31 @@ def explore(
         options: How steps are planned.
         counts: How often a demonstration takes an action.
         bounds: How far to go.
-        start: The keyframe to begin from; None: both feet where the robot starts.
+        start: What to go on from; None: both feet where the robot starts.
         report: Called with stage, share and note, for progress.
     """
     guide = _Guidance(ik.world, sequence, counts)
-    first = _State(keyframes=(start or standing(ik, options.keyframe),))
+    first = start or Reached(keyframes=(standing(ik, options.keyframe),))
     queue: list[_Entry] = []
     order = itertools.count()
     seen: set[frozenset] = set()
     often: Counter[frozenset] = Counter()  # like steps that were planned
     states = tries = 0
 
-    def expand(state: _State) -> None:
+    def expand(state: Reached) -> None:
         for a in guide.actions(ik.kin, state):
             push(state, a)
 
-    def priority(state: _State, a: _Action) -> float:
+    def priority(state: Reached, a: _Action) -> float:
         after = _after(state.keyframes[-1].stance, a.step.move)
         again = AGAIN * often[_kind(after)]
         return state.cost + a.price + EAGER * guide.left(after) + again
 
-    def push(state: _State, a: _Action) -> None:
+    def push(state: Reached, a: _Action) -> None:
         entry = _Entry(priority(state, a), next(order), state, a)
         heapq.heappush(queue, entry)
 
-    def ended(found: _State | None, stop: Stop) -> Explored:
+    def ended(found: Reached | None, stop: Stop) -> Explored:
         state = found or first
         return Explored(
             keyframes=state.keyframes,
@@ -243,15 +249,15 @@ def explore(
         seen |= {_key(after), _key(reached.keyframes[-1].stance)}
         if guide.arrived(reached.keyframes[-1]):
             return ended(reached, Stop.FOUND)
-        if len(reached.steps) < bounds.depth:
+        if len(reached.steps) - len(first.steps) < bounds.depth:
             states += 1
             expand(reached)
     return ended(None, Stop.EXHAUSTED)
 
 
 def _take(
-    ik: IK, state: _State, action: _Action, options: PlanOptions
-) -> _State | None:
+    ik: IK, state: Reached, action: _Action, options: PlanOptions
+) -> Reached | None:
     """The state that an action leads to; None where the step cannot be planned."""
     result = plan_step(
         ik,
@@ -263,7 +269,7 @@ def _take(
     )
     if isinstance(result, str):
         return None
-    return _State(
+    return Reached(
         keyframes=(*state.keyframes, result[0]),
         paths=(*state.paths, result[1]),
         steps=(*state.steps, action.step),
@@ -290,7 +296,7 @@ def _kind(stance: Sequence[Contact]) -> frozenset:
     return frozenset((c.surface, c.support) for c in stance)
 
 
-def _as_sequence(world: World, state: _State) -> ContactSequence:
+def _as_sequence(world: World, state: Reached) -> ContactSequence:
     """The stances that a state has come through, one a second.
 
     A contact is where it was made: a foot that goes on tiptoe later has not moved.
@@ -395,7 +401,7 @@ class _Guidance:
         """Whether its surface may be the one that a limb ends on."""
         return not self._stands or on_feet(self._world, [c])
 
-    def actions(self, kin: Kinematics, state: _State) -> list[_Action]:
+    def actions(self, kin: Kinematics, state: Reached) -> list[_Action]:
         """All that may be done in a state."""
         key, world = state.keyframes[-1], self._world
         region = region_of(key.stance)

@@ -174,10 +174,17 @@ def bearable(
     return np.array(corners)
 
 
-def least_torques(kin: Kinematics, demand: Demand, u: float, x: float) -> np.ndarray:
+def least_torques(
+    kin: Kinematics,
+    demand: Demand,
+    u: float,
+    x: float,
+    price: np.ndarray | None = None,
+) -> np.ndarray:
     """(na,) joint torques for (u, x) with the least contact forces in the cones.
 
-    Viscous damping of the joints is left to the controller.
+    Viscous damping of the joints is left to the controller. `price` (nc,) is that of
+    the force at each point; None: 1 each.
     """
     w = kin.world
     weight = w.mass * 9.81
@@ -189,7 +196,8 @@ def least_torques(kin: Kinematics, demand: Demand, u: float, x: float) -> np.nda
     along = np.sum(edges * normal, axis=1)
     # Tangential forces count four times, as in `contact_forces`.
     metric = 4.0 * edges @ edges.T - 3.0 * np.outer(along, along) * (normal @ normal.T)
-    H = np.kron(np.eye(nc), np.ones((m, m))) * metric + 1e-6 * np.eye(nc * m)
+    prices = np.eye(nc) if price is None else np.diag(price)
+    H = np.kron(prices, np.ones((m, m))) * metric + 1e-6 * np.eye(nc * m)
     H = H + _SLACK * (E[:6].T @ E[:6]) / weight**2
     f = -_SLACK * (E[:6].T @ total[:6]) / weight**2
     n = nc * m

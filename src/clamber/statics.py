@@ -505,10 +505,11 @@ def contact_forces(
     *,
     cone_edges: int = CONE_EDGES,
     torque: TorqueLimits | None = None,
+    price: np.ndarray | None = None,
 ) -> ContactForces:
     """The least contact forces that hold the robot against gravity.
 
-    Minimises `sum_i fn_i^2 + 4 ft_i^2 + 1e8 |residual|^2` over forces within the
+    Minimises `sum_i p_i (fn_i^2 + 4 ft_i^2) + 1e8 |residual|^2` over forces within the
     pyramids inside the friction cones; the residual is what is left of the balance of
     the whole body (and of joint torques beyond their limits). Strictly convex and
     always feasible: the forces are unique and continuous in every argument, and where
@@ -522,6 +523,7 @@ def contact_forces(
         mass: [kg].
         cone_edges: m of the pyramids.
         torque: Joint torques to keep within their limits.
+        price: (nc,) p, of a force at each point, positive; None: 1 each.
     """
     nc, na = len(points), 0 if torque is None else len(torque.dofs)
     if nc == 0:
@@ -534,6 +536,8 @@ def contact_forces(
     scale = np.full(nf + ns, SLACK_WEIGHT)
     scale[:nf] = TANGENTIAL_WEIGHT
     scale[2:nf:3] = 1.0
+    if price is not None:
+        scale[:nf] *= np.repeat(price, 3)
     np.fill_diagonal(H, scale)
     A = np.zeros((ns + nc * cone_edges, nf + ns))
     upper, lower = np.zeros(len(A)), np.full(len(A), -1e30)

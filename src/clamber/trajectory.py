@@ -7,7 +7,7 @@ normalised spline of its quaternion, so that the angular velocity is its derivat
 the manifold.
 
 Feed-forward torques balance gravity with the contact forces of least norm at every
-posture, and are interpolated along the spline.
+posture, those of leaving contacts ever dearer, and are interpolated along the spline.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
 SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
 GRAVITY = 9.81  # [m/s^2]
 EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
+LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
 TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
 
@@ -92,24 +93,51 @@ class Trajectory:
 
 def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
     """(n, na) torques that hold each posture of a phase, load handed over along it."""
-    ends = []
-    for load in (phase.load_before, phase.load_after):
-        ends.append([holding_torque(kin, q, load) for q in phase.q])
-        if phase.load_after is phase.load_before:
-            ends.append(ends[0])
-            break
     share = _arclength(kin, phase.q)
-    share = (share / share[-1])[:, None] if share[-1] > 0 else np.zeros((len(share), 1))
-    return (1 - share) * np.array(ends[0]) + share * np.array(ends[1])
+    share = share / share[-1] if share[-1] > 0 else share
+    return np.array(
+        [
+            holding_torque(kin, q, *handed_over(phase, float(s)))
+            for q, s in zip(phase.q, share, strict=True)
+        ]
+    )
+
+
+def handed_over(phase: Phase, share: float) -> tuple[tuple[Contact, ...], np.ndarray]:
+    """Contacts (n of them) that may bear at a share of a phase, and prices of force.
+
+    The price of a contact that only bears at the start is 1 / (1 - share), of one that
+    only bears at the end 1 / share, of others 1: load passes from the ones to the
+    others, but only as far as the robot's balance allows. While the centre of mass is
+    not yet over the contacts that stay, those that leave go on bearing.
+    """
+    before = {(c.surface, c.edge): c for c in phase.load_before}
+    after = {(c.surface, c.edge): c for c in phase.load_after}
+    contacts, price = [], []
+    for key, c in {**before, **after}.items():
+        left = 1.0 - share * (key not in after) - (1.0 - share) * (key not in before)
+        if left > LEAST_SHARE:
+            contacts.append(c)
+            price.append(1.0 / left)
+    return tuple(contacts), np.array(price)
 
 
 def holding_torque(
-    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
+    kin: Kinematics,
+    q: np.ndarray,
+    contacts: Sequence[Contact],
+    price: np.ndarray | None = None,
 ) -> np.ndarray:
     """(na,) joint torques that balance gravity with the least contact forces.
 
     Where these ask more of a joint than `EFFORT_SHARE` of its limit, those that do not:
     a weak wrist leaves the load to the feet.
+
+    Args:
+        kin: Workspace.
+        q: (nq,).
+        contacts: n that may bear.
+        price: (n,) of the force of each; None: 1 each.
     """
     w = kin.world
     kin.update(q)
@@ -118,8 +146,11 @@ def holding_torque(
     com = kin.com.copy()
     limits = EFFORT_SHARE * w.tau_max
     tau, torque = np.zeros(len(w.dadr)), None
+    prices = None if price is None else point_prices(kin, contacts, price)
     for _ in range(2):
-        found = contact_forces(points, normals, mu, com, w.mass, torque=torque)
+        found = contact_forces(
+            points, normals, mu, com, w.mass, torque=torque, price=prices
+        )
         total = gravity
         for name, p, f in zip(names, points, found.forces, strict=True):
             total = total - kin.point_jacobian(w.surfaces[name].body, p).T @ f
@@ -128,6 +159,18 @@ def holding_torque(
             break
         torque = torque_limits(kin, names, points, EFFORT_SHARE)
     return np.clip(tau, -w.tau_max, w.tau_max)
+
+
+def point_prices(
+    kin: Kinematics, contacts: Sequence[Contact], price: np.ndarray
+) -> np.ndarray:
+    """(nc,) the price of each bearing point, from those of the contacts (n,)."""
+    up = [kin.world.supports[c.support].normal for c in contacts]
+    count = [
+        len(kin.bearing_points(c.surface, n, c.edge))
+        for c, n in zip(contacts, up, strict=True)
+    ]
+    return np.repeat(price, count)
 
 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
@@ -293,17 +336,11 @@ def _fastest(
     bend = _bend(spline.curve, s[look])
     tau = []
     for i, k in enumerate(look):
-        ends = [
-            least_torques(
-                kin,
-                demand_at(kin, q[i], slope[i], bend[i], load),
-                float(change[k]),
-                float(rate[k] ** 2),
-            )
-            for load in (phase.load_before, phase.load_after)
-        ]
-        share = s[k] / spline.length
-        tau.append((1.0 - share) * ends[0] + share * ends[1])
+        contacts, price = handed_over(phase, s[k] / spline.length)
+        demand = demand_at(kin, q[i], slope[i], bend[i], contacts)
+        prices = point_prices(kin, contacts, price)
+        squared = float(rate[k] ** 2)
+        tau.append(least_torques(kin, demand, float(change[k]), squared, prices))
     return s, rate, make_interp_spline(look, np.array(tau), k=1)(np.arange(len(s)))
 
 
