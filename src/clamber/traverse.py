@@ -74,6 +74,7 @@ BESIDE_TOL = 0.10  # [m] along the edge
 REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
+STRETCH = 0.57  # lengths of the trunk from the body's middle to hands or knees
 LEAN = np.radians(80.0)  # of the trunk on all fours
 FLUSH = 0.01  # [m] tops that differ by less are no stairs
 # Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
@@ -128,6 +129,7 @@ class _Build:
         reach: From the feet to an edge, at most [m].
         tall: Height that hands reach, standing [m].
         thigh: [m]
+        stretch: Half of what it is stretched by on hands and knees [m].
         round: Radius of what the body takes up while it turns on all fours [m].
     """
 
@@ -139,6 +141,7 @@ class _Build:
     reach: float
     tall: float
     thigh: float
+    stretch: float
     round: float
 
 
@@ -678,7 +681,13 @@ def _crawl(
     """One cycle towards `wanted`."""
     option = next(o for o in task.policy.options if o.region == "O")
     step = _crawl_step(task)
-    full = _between(frame, _heading(task, platform, frame, wanted), step, TURN)
+    if _gaps_ahead(platform, key.stance, wanted.xy):
+        wanted = _Frame(wanted.xy, platform.entry.yaw)
+    heading = _heading(task, platform, frame, wanted)
+    made = _over_gap(task, key, platform, option, frame, heading)
+    if made:
+        return made, ""
+    full = _between(frame, heading, step, TURN)
     tries = (
         full,
         _share(frame, full, 0.5),
@@ -773,6 +782,117 @@ def _over_riser(
                 if made and not left:
                     return made
     return []
+
+
+def _gaps_ahead(
+    platform: Platform, stance: Sequence[Contact], wanted: np.ndarray
+) -> list[tuple[float, float]]:
+    """Gaps that not all contacts have passed on the way to `wanted` (2,).
+
+    Where each begins and ends, from the contact that is last on the way [m].
+    """
+    points = np.array([c.position[:2] for c in stance])
+    way = wanted - points.mean(axis=0)
+    way /= max(float(np.linalg.norm(way)), 1e-9)
+    last = points[np.argmin(points @ way)]
+    spans = [tuple(map(float, (gap - last) @ way)) for gap in platform.gaps]
+    return [
+        (near, far)
+        for near, far in spans
+        if far > 0.0 and near < (wanted - last) @ way
+    ]
+
+
+def _over_gap(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    frame: _Frame,
+    wanted: _Frame,
+) -> list[_Made]:
+    """One cycle near a gap; empty: there is none, or no way.
+
+    Each limb has its place in a body that is stretched. The body goes on along the way
+    until a limb is due, and by a step beyond. Over a gap, the place of a limb is the
+    nearer border: it waits at the one, and steps to the other when it is due there.
+    What is due first steps first. Where elbows and knees do not reach across, hands do,
+    and knees do from a stand on both feet.
+    """
+    if abs(_apart(frame.yaw, wanted.yaw)) > FACING:
+        return []
+    gaps = _gaps_ahead(platform, key.stance, wanted.xy)
+    on, step = _by_limb(task, key.stance), _crawl_step(task)
+    length = float(np.linalg.norm(wanted.xy - frame.xy))
+    way = (wanted.xy - frame.xy) / max(length, 1e-9)
+    at = {n: float((c.position[:2] - frame.xy) @ way) for n, c in on.items()}
+    if not gaps or gaps[0][0] > max(at.values()) - min(at.values()) + step:
+        return []
+    robot = task.ik.world.robot
+    limbs = {robot.limb_of(s).name: s for s in option.surfaces}
+    stretched = {
+        n: np.array([math.copysign(task.build.stretch, offset[0]), offset[1]])
+        for n, offset in task.build.fours.items()
+    }
+
+    def place(name: str, x: float) -> Place:
+        body = _Frame(frame.xy + x * way, wanted.yaw)
+        target = body.at(stretched[name])
+        return _place(task, platform, limbs[name], target, platform.boxes)
+
+    x = min(at[n] - stretched[n][0] for n in limbs)
+    due: dict[str, float] = {}
+    while x < length and not (due and x > min(due.values()) + step):
+        x += SAME
+        for n in limbs:
+            ahead = float((place(n, x).position[:2] - frame.xy) @ way) - at[n]
+            if n not in due and ahead > SAME:
+                due[n] = x
+    body = _Frame(frame.xy + x * way, wanted.yaw)
+    places = {n: place(n, x) for n in sorted(due, key=lambda n: due[n])}
+    inner, outer, feet = [], [], []
+    for n, target in places.items():
+        hand_or_foot = robot.limbs[n].surfaces[0]
+        arm = robot.limbs[n].is_arm
+        inner.append(((on[n].surface if arm else limbs[n],), target))
+        outer.append(((hand_or_foot, limbs[n])[:: 1 if arm else -1], target))
+        if not arm and on[n].surface == limbs[n] and target.support != on[n].support:
+            here = Place(support=on[n].support, position=on[n].position)
+            feet.append(((hand_or_foot,), here))
+    for moves in (inner, feet + outer):
+        made, left = _moved(task, key, option, body, moves)
+        if made and (not left or moves is not inner):
+            return made
+    return []
+
+
+def _moved(
+    task: _Task,
+    key: Keyframe,
+    option: Option,
+    body: _Frame,
+    moves: Sequence[tuple[Sequence[str], Place]],
+) -> tuple[list[_Made], list[str]]:
+    """Contacts made one after the other, by the first of some surfaces of a limb.
+
+    What was made, and the surfaces for which there is no way.
+    """
+    made: list[_Made] = []
+    left = []
+    for surfaces, place in moves:
+        for surface in surfaces:
+            limb = task.ik.world.robot.limb_of(surface).name
+            here = _by_limb(task, key.stance).get(limb)
+            found = _attempt(
+                task, key, surface, here, place, body, task.fours, imposed=False
+            )
+            if not isinstance(found, str):
+                key, path = found
+                made.append((key, path, option.name))
+                break
+        else:
+            left.append(surfaces[0])
+    return made, left
 
 
 def _twice(
@@ -1089,6 +1209,7 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
         reach=STAND * leg + REACH * arm,
         tall=leg + trunk + arm,
         thigh=thigh,
+        stretch=STRETCH * trunk,
         # The shanks trail behind the knees.
         round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
     )
