@@ -14,7 +14,7 @@ moves, reversed, is where a move of the descent is looked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -813,86 +813,116 @@ def _over_gap(
 ) -> list[_Made]:
     """One cycle near a gap; empty: there is none, or no way.
 
-    Each limb has its place in a body that is stretched. The body goes on along the way
-    until a limb is due, and by a step beyond. Over a gap, the place of a limb is the
-    nearer border: it waits at the one, and steps to the other when it is due there.
-    What is due first steps first. Where elbows and knees do not reach across, hands do,
-    and knees do from a stand on both feet.
+    Where elbows and knees do not reach across, hands do, and knees do from a stand on
+    both feet.
     """
     if abs(_apart(frame.yaw, wanted.yaw)) > FACING:
         return []
-    gaps = _gaps_ahead(platform, key.stance, wanted.xy)
-    on, step = _by_limb(task, key.stance), _crawl_step(task)
+    surfaces = {task.ik.world.robot.limb_of(s).name: s for s in option.surfaces}
+    on = _by_limb(task, key.stance)
+    walks, hops = _due_near_gap(task, platform, on, surfaces, frame, wanted)
+    limbs = task.ik.world.robot.limbs
+    made: list[_Made] = []
+    for n, place in walks.items():
+        own = (on[n].surface, *limbs[n].surfaces) if limbs[n].is_arm else (surfaces[n],)
+        _make(task, key, option, wanted, own, place, made)
+    before = len(made)
+    for surface, place in ((surfaces[n], p) for n, p in hops.items()):
+        _make(task, key, option, wanted, (surface,), place, made)
+    if len(made) == before + len(hops):
+        return made
+    del made[before:]
+    for n in hops:
+        if not limbs[n].is_arm and on[n].surface == surfaces[n]:
+            here = Place(support=on[n].support, position=on[n].position)
+            _make(task, key, option, wanted, limbs[n].surfaces[:1], here, made)
+    standing = len(made)
+    for n, place in hops.items():
+        order = 1 if limbs[n].is_arm else -1
+        own = limbs[n].surfaces[::order]
+        _make(task, key, option, wanted, own, place, made)
+    return made[: before if len(made) == standing else None]
+
+
+def _due_near_gap(
+    task: _Task,
+    platform: Platform,
+    on: Mapping[str, Contact],
+    surfaces: Mapping[str, str],
+    frame: _Frame,
+    wanted: _Frame,
+) -> tuple[dict[str, Place], dict[str, Place]]:
+    """The limbs that are next near a gap, which step on a box, and which across.
+
+    Each limb has its place in a body that is stretched, and goes on along the way. Over
+    a gap, its place is the nearer border: it waits at the one until it is due at the
+    other. The body goes on by a step from where the first limb is due, or until some
+    are due across; what is due first steps first. Both are empty far from a gap.
+    """
+    step = _crawl_step(task)
     length = float(np.linalg.norm(wanted.xy - frame.xy))
     way = (wanted.xy - frame.xy) / max(length, 1e-9)
     at = {n: float((c.position[:2] - frame.xy) @ way) for n, c in on.items()}
-    if not gaps or gaps[0][0] > max(at.values()) - min(at.values()) + step:
-        return []
-    robot = task.ik.world.robot
-    limbs = {robot.limb_of(s).name: s for s in option.surfaces}
-    stretched = {
-        n: np.array([math.copysign(task.build.stretch, offset[0]), offset[1]])
-        for n, offset in task.build.fours.items()
+    gaps = _gaps_ahead(platform, tuple(on.values()), wanted.xy)
+    if len(on) < len(surfaces) or not gaps:
+        return {}, {}
+    if gaps[0][0] > max(at.values()) - min(at.values()) + step:
+        return {}, {}
+    offsets = {
+        n: np.array([math.copysign(task.build.stretch, o[0]), o[1]])
+        for n, o in task.build.fours.items()
     }
 
-    def place(name: str, x: float) -> Place:
-        body = _Frame(frame.xy + x * way, wanted.yaw)
-        target = body.at(stretched[name])
-        return _place(task, platform, limbs[name], target, platform.boxes)
+    def place(n: str, x: float) -> Place:
+        xy = _Frame(frame.xy + x * way, wanted.yaw).at(offsets[n])
+        return _place(task, platform, surfaces[n], xy, platform.boxes)
 
-    x = min(at[n] - stretched[n][0] for n in limbs)
-    due: dict[str, float] = {}
-    while x < length and not (due and x > min(due.values()) + step):
+    x = min(at[n] - offsets[n][0] for n in surfaces)
+    walks: dict[str, float] = {}
+    hops: dict[str, float] = {}
+    while x < length and x <= min((*walks.values(), *hops.values()), default=x) + step:
         x += SAME
-        for n in limbs:
-            ahead = float((place(n, x).position[:2] - frame.xy) @ way) - at[n]
-            if n not in due and ahead > SAME:
-                due[n] = x
-    body = _Frame(frame.xy + x * way, wanted.yaw)
-    places = {n: place(n, x) for n in sorted(due, key=lambda n: due[n])}
-    inner, outer, feet = [], [], []
-    for n, target in places.items():
-        hand_or_foot = robot.limbs[n].surfaces[0]
-        arm = robot.limbs[n].is_arm
-        inner.append(((on[n].surface if arm else limbs[n],), target))
-        outer.append(((hand_or_foot, limbs[n])[:: 1 if arm else -1], target))
-        if not arm and on[n].surface == limbs[n] and target.support != on[n].support:
-            here = Place(support=on[n].support, position=on[n].position)
-            feet.append(((hand_or_foot,), here))
-    for moves in (inner, feet + outer):
-        made, left = _moved(task, key, option, body, moves)
-        if made and (not left or moves is not inner):
-            return made
-    return []
+        for n in surfaces:
+            to = place(n, x)
+            ahead = float((to.position[:2] - frame.xy) @ way) - at[n]
+            if ahead > SAME and to.support != on[n].support:
+                hops.setdefault(n, x)
+            elif ahead > SAME and n not in hops:
+                walks.setdefault(n, x)
+    first = min(hops, key=lambda n: hops[n], default=None)
+    if first is not None:
+        arm = task.ik.world.robot.limbs[first].is_arm
+        x = hops[first]
+        hops = {
+            n: d for n, d in hops.items() if task.ik.world.robot.limbs[n].is_arm == arm
+        }
+    walks = {n: d for n, d in walks.items() if d <= x and n not in hops}
+    return (
+        {n: place(n, x) for n in sorted(walks, key=lambda n: walks[n])},
+        {n: place(n, hops[n]) for n in sorted(hops, key=lambda n: hops[n])},
+    )
 
 
-def _moved(
+def _make(
     task: _Task,
     key: Keyframe,
     option: Option,
     body: _Frame,
-    moves: Sequence[tuple[Sequence[str], Place]],
-) -> tuple[list[_Made], list[str]]:
-    """Contacts made one after the other, by the first of some surfaces of a limb.
-
-    What was made, and the surfaces for which there is no way.
-    """
-    made: list[_Made] = []
-    left = []
-    for surfaces, place in moves:
-        for surface in surfaces:
-            limb = task.ik.world.robot.limb_of(surface).name
-            here = _by_limb(task, key.stance).get(limb)
-            found = _attempt(
-                task, key, surface, here, place, body, task.fours, imposed=False
-            )
-            if not isinstance(found, str):
-                key, path = found
-                made.append((key, path, option.name))
-                break
-        else:
-            left.append(surfaces[0])
-    return made, left
+    surfaces: Sequence[str],
+    place: Place,
+    made: list[_Made],
+) -> None:
+    """Add to `made`, which begins at `key`, a contact by the first surface that can."""
+    key = made[-1][0] if made else key
+    for surface in surfaces:
+        limb = task.ik.world.robot.limb_of(surface).name
+        here = _by_limb(task, key.stance).get(limb)
+        found = _attempt(
+            task, key, surface, here, place, body, task.fours, imposed=False
+        )
+        if not isinstance(found, str):
+            made.append((*found, option.name))
+            return
 
 
 def _twice(
