@@ -17,9 +17,8 @@ from clamber.errors import InputError
 from clamber.policy import Edge
 from clamber.scene import GROUND_HALF_SIZE, Scene, Support
 
-GAP = (
-    0.30  # [m] a narrower gap is crawled across; in a wider one there is room to stand
-)
+GAP = 0.45  # [m] a narrower gap is crossed on top, a wider one on the ground
+JOINT = 0.02  # [m] a narrower gap is none
 BESIDE = (
     0.25  # [m] a gate keeps so far from the ends of its edge, where it is that long
 )
@@ -36,11 +35,13 @@ class Platform:
         boxes: Names, in the order in which the line from start to goal meets them.
         entry: Edge that is climbed up; its point is where.
         exit: Edge that is climbed down; None: the goal is on top.
+        gaps: Between boxes, (2, 2) each: on the line, where it begins and ends [m].
     """
 
     boxes: tuple[str, ...]
     entry: Edge
     exit: Edge | None
+    gaps: tuple[np.ndarray, ...] = ()
 
     @property
     def edges(self) -> tuple[Edge, ...]:
@@ -103,7 +104,13 @@ def find_platforms(scene: Scene, goal: np.ndarray) -> tuple[Platform, ...]:
         if last[1] < 1.0:
             down = _edge(last[2], goal, start, 1.0 - last[1])
         boxes = tuple(top.name for _, _, top in group)
-        out.append(Platform(boxes=boxes, entry=up, exit=down))
+        shares, end = [], group[0][1]
+        for t0, t1, _ in group[1:]:
+            if (t0 - end) * length > JOINT:
+                shares.append((end, t0))
+            end = max(end, t1)
+        gaps = tuple(start + np.outer(x, goal - start) for x in shares)
+        out.append(Platform(boxes=boxes, entry=up, exit=down, gaps=gaps))
     return tuple(out)
 
 

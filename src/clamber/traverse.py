@@ -14,7 +14,7 @@ moves, reversed, is where a move of the descent is looked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,6 +74,7 @@ BESIDE_TOL = 0.10  # [m] along the edge
 REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
+STRETCH = 0.57  # lengths of the trunk from the body's middle to hands or knees
 LEAN = np.radians(80.0)  # of the trunk on all fours
 FLUSH = 0.01  # [m] tops that differ by less are no stairs
 # Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
@@ -130,6 +131,7 @@ class _Build:
         reach: From the feet to an edge, at most [m].
         tall: Height that hands reach, standing [m].
         thigh: [m]
+        stretch: Half of what it is stretched by on hands and knees [m].
         round: Radius of what the body takes up while it turns on all fours [m].
     """
 
@@ -141,6 +143,7 @@ class _Build:
     reach: float
     tall: float
     thigh: float
+    stretch: float
     round: float
 
 
@@ -697,7 +700,13 @@ def _crawl(
     """One cycle towards `wanted`."""
     option = next(o for o in task.policy.options if o.region == "O")
     step = _crawl_step(task)
-    full = _between(frame, _heading(task, platform, frame, wanted), step, TURN)
+    if _gaps_ahead(platform, key.stance, wanted.xy):
+        wanted = _Frame(wanted.xy, platform.entry.yaw)
+    heading = _heading(task, platform, frame, wanted)
+    made = _over_gap(task, key, platform, option, frame, heading)
+    if made:
+        return made, ""
+    full = _between(frame, heading, step, TURN)
     tries = (
         full,
         _share(frame, full, 0.5),
@@ -792,6 +801,147 @@ def _over_riser(
                 if made and not left:
                     return made
     return []
+
+
+def _gaps_ahead(
+    platform: Platform, stance: Sequence[Contact], wanted: np.ndarray
+) -> list[tuple[float, float]]:
+    """Gaps that not all contacts have passed on the way to `wanted` (2,).
+
+    Where each begins and ends, from the contact that is last on the way [m].
+    """
+    points = np.array([c.position[:2] for c in stance])
+    way = wanted - points.mean(axis=0)
+    way /= max(float(np.linalg.norm(way)), 1e-9)
+    last = points[np.argmin(points @ way)]
+    spans = [tuple(map(float, (gap - last) @ way)) for gap in platform.gaps]
+    return [
+        (near, far)
+        for near, far in spans
+        if far > 0.0 and near < (wanted - last) @ way
+    ]
+
+
+def _over_gap(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    option: Option,
+    frame: _Frame,
+    wanted: _Frame,
+) -> list[_Made]:
+    """One cycle near a gap; empty: there is none, or no way.
+
+    Where elbows and knees do not reach across, hands do, and knees do from a stand on
+    both feet.
+    """
+    if abs(_apart(frame.yaw, wanted.yaw)) > FACING:
+        return []
+    surfaces = {task.ik.world.robot.limb_of(s).name: s for s in option.surfaces}
+    on = _by_limb(task, key.stance)
+    walks, hops = _due_near_gap(task, platform, on, surfaces, frame, wanted)
+    limbs = task.ik.world.robot.limbs
+    made: list[_Made] = []
+    for n, place in walks.items():
+        own = (on[n].surface, *limbs[n].surfaces) if limbs[n].is_arm else (surfaces[n],)
+        _make(task, key, option, wanted, own, place, made)
+    before = len(made)
+    for surface, place in ((surfaces[n], p) for n, p in hops.items()):
+        _make(task, key, option, wanted, (surface,), place, made)
+    if len(made) == before + len(hops):
+        return made
+    del made[before:]
+    for n in hops:
+        if not limbs[n].is_arm and on[n].surface == surfaces[n]:
+            here = Place(support=on[n].support, position=on[n].position)
+            _make(task, key, option, wanted, limbs[n].surfaces[:1], here, made)
+    standing = len(made)
+    for n, place in hops.items():
+        order = 1 if limbs[n].is_arm else -1
+        own = limbs[n].surfaces[::order]
+        _make(task, key, option, wanted, own, place, made)
+    return made[: before if len(made) == standing else None]
+
+
+def _due_near_gap(
+    task: _Task,
+    platform: Platform,
+    on: Mapping[str, Contact],
+    surfaces: Mapping[str, str],
+    frame: _Frame,
+    wanted: _Frame,
+) -> tuple[dict[str, Place], dict[str, Place]]:
+    """The limbs that are next near a gap, which step on a box, and which across.
+
+    Each limb has its place in a body that is stretched, and goes on along the way. Over
+    a gap, its place is the nearer border: it waits at the one until it is due at the
+    other. The body goes on by a step from where the first limb is due, or until some
+    are due across; what is due first steps first. Both are empty far from a gap.
+    """
+    step = _crawl_step(task)
+    length = float(np.linalg.norm(wanted.xy - frame.xy))
+    way = (wanted.xy - frame.xy) / max(length, 1e-9)
+    at = {n: float((c.position[:2] - frame.xy) @ way) for n, c in on.items()}
+    gaps = _gaps_ahead(platform, tuple(on.values()), wanted.xy)
+    if len(on) < len(surfaces) or not gaps:
+        return {}, {}
+    if gaps[0][0] > max(at.values()) - min(at.values()) + step:
+        return {}, {}
+    offsets = {
+        n: np.array([math.copysign(task.build.stretch, o[0]), o[1]])
+        for n, o in task.build.fours.items()
+    }
+
+    def place(n: str, x: float) -> Place:
+        xy = _Frame(frame.xy + x * way, wanted.yaw).at(offsets[n])
+        return _place(task, platform, surfaces[n], xy, platform.boxes)
+
+    x = min(at[n] - offsets[n][0] for n in surfaces)
+    walks: dict[str, float] = {}
+    hops: dict[str, float] = {}
+    while x < length and x <= min((*walks.values(), *hops.values()), default=x) + step:
+        x += SAME
+        for n in surfaces:
+            to = place(n, x)
+            ahead = float((to.position[:2] - frame.xy) @ way) - at[n]
+            if ahead > SAME and to.support != on[n].support:
+                hops.setdefault(n, x)
+            elif ahead > SAME and n not in hops:
+                walks.setdefault(n, x)
+    first = min(hops, key=lambda n: hops[n], default=None)
+    if first is not None:
+        arm = task.ik.world.robot.limbs[first].is_arm
+        x = hops[first]
+        hops = {
+            n: d for n, d in hops.items() if task.ik.world.robot.limbs[n].is_arm == arm
+        }
+    walks = {n: d for n, d in walks.items() if d <= x and n not in hops}
+    return (
+        {n: place(n, x) for n in sorted(walks, key=lambda n: walks[n])},
+        {n: place(n, hops[n]) for n in sorted(hops, key=lambda n: hops[n])},
+    )
+
+
+def _make(
+    task: _Task,
+    key: Keyframe,
+    option: Option,
+    body: _Frame,
+    surfaces: Sequence[str],
+    place: Place,
+    made: list[_Made],
+) -> None:
+    """Add to `made`, which begins at `key`, a contact by the first surface that can."""
+    key = made[-1][0] if made else key
+    for surface in surfaces:
+        limb = task.ik.world.robot.limb_of(surface).name
+        here = _by_limb(task, key.stance).get(limb)
+        found = _attempt(
+            task, key, surface, here, place, body, task.fours, imposed=False
+        )
+        if not isinstance(found, str):
+            made.append((*found, option.name))
+            return
 
 
 def _twice(
@@ -1114,6 +1264,7 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
         reach=STAND * leg + REACH * arm,
         tall=leg + trunk + arm,
         thigh=thigh,
+        stretch=STRETCH * trunk,
         # The shanks trail behind the knees.
         round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
     )
