@@ -54,6 +54,7 @@ from clamber.route import (
 from clamber.scene import GROUND, Scene
 from clamber.se3 import matrix_from_quat, quat_from_matrix
 from clamber.search import home_at, plan_step, standing
+from clamber.stairs import FLUSH, Gait, is_flight, next_contacts
 
 STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
 TURN = 0.25  # [rad] of the body in one cycle on all fours
@@ -75,7 +76,6 @@ REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 # Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
 LEAN = np.radians(80.0)  # of the trunk on all fours
-FLUSH = 0.01  # [m] tops that differ by less are no stairs
 # Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
 # its upper edge before it leans far enough for the weight to get past the other knee.
 BEFORE_RISER = 0.5
@@ -129,6 +129,7 @@ class _Build:
         tall: Height that hands reach, standing [m].
         thigh: [m]
         round: Radius of what the body takes up while it turns on all fours [m].
+        gait: On stairs.
     """
 
     step: dict[str, float]
@@ -140,6 +141,7 @@ class _Build:
     tall: float
     thigh: float
     round: float
+    gait: Gait
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -281,7 +283,11 @@ def _manoeuvre(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
         feet = np.mean([c.position for c in grounded], axis=0)
         if platform.exit is not None and platform.exit.distance(feet) < 0:
             return _climb_down(task, key, platform)
-        return _climb_up(task, key, platform.entry, platform)
+        return _climb(task, key, platform)
+    if is_flight(task.ik.world, platform):
+        made, why = _up_stairs(task, key, platform)
+        if made or why:
+            return made, why
     return _on_fours(task, key, platform)
 
 
@@ -307,7 +313,7 @@ def _on_feet(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
             and abs(_apart(frame.yaw, wanted.yaw)) <= FACING
         )
         if near:
-            return _climb_up(task, key, ahead.entry, ahead)
+            return _climb(task, key, ahead)
         return _walk(task, key, frame, wanted)
     wanted = _Frame(task.goal, frame.yaw if task.goal_yaw is None else task.goal_yaw)
     if _there(frame, wanted):
@@ -386,6 +392,56 @@ def _ankles(task: _Task, body: _Frame) -> np.ndarray:
 
 
 # Up and down.
+
+
+def _climb(task: _Task, key: Keyframe, platform: Platform) -> tuple[list[_Made], str]:
+    """The next contacts of a flight of stairs, or all that is left of a climb."""
+    if is_flight(task.ik.world, platform):
+        return _up_stairs(task, key, platform)
+    return _climb_up(task, key, platform.entry, platform)
+
+
+def _up_stairs(
+    task: _Task, key: Keyframe, platform: Platform
+) -> tuple[list[_Made], str]:
+    """The next pair of contacts; why not all of them; neither where it is up."""
+    world = task.ik.world
+    wanted = next_contacts(world, platform, key.stance, task.build.gait)
+    body = _Frame(platform.entry.point, platform.entry.yaw)
+    made: list[_Made] = []
+    why = ""
+    # What cannot move yet is tried again once the other has.
+    for _ in range(2):
+        left = []
+        for surface, places in wanted:
+            here = _by_limb(task, key.stance).get(world.robot.limb_of(surface).name)
+            for place in places:
+                found = _attempt(
+                    task,
+                    key,
+                    surface,
+                    here,
+                    place,
+                    body,
+                    None,
+                    shares=SHRUNK[:1],
+                    imposed=False,
+                )
+                if not isinstance(found, str):
+                    key, path = found
+                    made.append((key, path, _option_with(task, surface).name))
+                    break
+                why = found
+            else:
+                left.append((surface, places))
+        wanted = left
+    return made, why if not made else ""
+
+
+def _option_with(task: _Task, surface: str) -> Option:
+    """The first of the policy that moves a surface; else the last."""
+    options = task.policy.options
+    return next((o for o in options if surface in o.surfaces), options[-1])
 
 
 def _climb_up(
@@ -1080,17 +1136,33 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
     thigh = float(
         np.linalg.norm(kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1])
     )
+    feet = 0.5 * float(np.linalg.norm(soles[0] - soles[1]))
+    ahead = along.T @ (np.mean(soles, axis=0) - world.scene.start[:2])
+    stand, arm_step = STAND * leg, min(step[x.name] for x in arms)
+    sides = {}
+    for x in limbs:
+        y = fours[x.name][1]
+        sides |= dict.fromkeys(x.surfaces, float(y))
+        if not x.is_arm:
+            sides[x.surfaces[0]] = math.copysign(feet, y)
     return _Build(
         step=step,
         fours=fours,
-        feet=0.5 * float(np.linalg.norm(soles[0] - soles[1])),
-        ahead=along.T @ (np.mean(soles, axis=0) - world.scene.start[:2]),
-        stand=STAND * leg,
-        reach=STAND * leg + REACH * arm,
+        feet=feet,
+        ahead=ahead,
+        stand=stand,
+        reach=stand + REACH * arm,
         tall=leg + trunk + arm,
         thigh=thigh,
         # The shanks trail behind the knees.
         round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
+        gait=Gait(
+            lead=stand + DEPTH["hand"] * arm_step,
+            gap=arm_step,
+            knee=DEPTH["knee"] * min(step[x.name] for x in legs),
+            span=float(fours[arms[0].name][0] - fours[legs[0].name][0]),
+            sides=sides,
+        ),
     )
 
 
