@@ -67,9 +67,12 @@ class _Tread:
         """The spot nearest to x."""
         return _Spot(self.name, float(np.clip(x, self.low, self.high)))
 
-    def up_to(self, x: float) -> _Spot | None:
-        """The farthest spot that is no farther than x."""
-        return _Spot(self.name, min(x, self.high)) if x >= self.low else None
+    def up_to(self, x: float) -> list[_Spot]:
+        """The farthest spot that is no farther than x, and the nearest one."""
+        if x < self.low:
+            return []
+        far = min(x, self.high)
+        return [_Spot(self.name, p) for p in dict.fromkeys((far, self.low))]
 
 
 def is_flight(world: World, platform: Platform) -> bool:
@@ -135,8 +138,8 @@ def next_contacts(
     before = min(x[b.name] for b in arms) - gait.gap
     for leg in on if on == legs else ():
         room = treads(leg.surfaces[0])
-        spots = [s for t in room[:-1] if (s := t.up_to(before)) is not None]
-        spots = [s for s in spots[::-1] if s.x - x[leg.name] >= WORTH]
+        spots = [s for t in room[-2::-1] for s in t.up_to(before)]
+        spots = [s for s in spots if s.x - x[leg.name] >= WORTH]
         if spots:
             feet.append(places(leg.surfaces[0], spots))
     if feet:

@@ -404,38 +404,56 @@ def _climb(task: _Task, key: Keyframe, platform: Platform) -> tuple[list[_Made],
 def _up_stairs(
     task: _Task, key: Keyframe, platform: Platform
 ) -> tuple[list[_Made], str]:
-    """The next pair of contacts; why not all of them; neither where it is up."""
-    world = task.ik.world
-    wanted = next_contacts(world, platform, key.stance, task.build.gait)
+    """The next contacts, usually a pair; why there are none; neither where it is up.
+
+    Where not all of a pair get to their places, all go to their next best.
+    """
+    wanted = next_contacts(task.ik.world, platform, key.stance, task.build.gait)
+    some: list[_Made] = []
+    why = ""
+    for rank in range(max((len(places) for _, places in wanted), default=0)):
+        these = [(s, places[min(rank, len(places) - 1)]) for s, places in wanted]
+        made, why = _set_all(task, key, platform, these)
+        if not why:
+            return made, ""
+        some = some or made
+    return some, "" if some else why
+
+
+def _set_all(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    wanted: Sequence[tuple[str, Place]],
+) -> tuple[list[_Made], str]:
+    """Surfaces set down at their places; why not the last of those that are not."""
     body = _Frame(platform.entry.point, platform.entry.yaw)
+    limb_of = task.ik.world.robot.limb_of
     made: list[_Made] = []
     why = ""
-    # What cannot move yet is tried again once the other has.
-    for _ in range(2):
-        left = []
-        for surface, places in wanted:
-            here = _by_limb(task, key.stance).get(world.robot.limb_of(surface).name)
-            for place in places:
-                found = _attempt(
-                    task,
-                    key,
-                    surface,
-                    here,
-                    place,
-                    body,
-                    None,
-                    shares=SHRUNK[:1],
-                    imposed=False,
-                )
-                if not isinstance(found, str):
-                    key, path = found
-                    made.append((key, path, _option_with(task, surface).name))
-                    break
+    for _ in range(2):  # what cannot move yet is tried again once the others have
+        left, why = [], ""
+        for surface, place in wanted:
+            here = _by_limb(task, key.stance).get(limb_of(surface).name)
+            found = _attempt(
+                task,
+                key,
+                surface,
+                here,
+                place,
+                body,
+                None,
+                shares=SHRUNK[:1],
+                imposed=False,
+            )
+            if isinstance(found, str):
+                left.append((surface, place))
                 why = found
-            else:
-                left.append((surface, places))
+                continue
+            key, path = found
+            made.append((key, path, _option_with(task, surface).name))
         wanted = left
-    return made, why if not made else ""
+    return made, why
 
 
 def _option_with(task: _Task, surface: str) -> Option:
