@@ -41,7 +41,12 @@ from clamber.policy import (
     pelvis_distribution,
     pelvis_rotation,
 )
-from clamber.posture.ik import IK, PostureProblem
+from clamber.posture.ik import (
+    IK,
+    PostureProblem,
+    base_clearance,
+    contact_clearance,
+)
 from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
 from clamber.route import (
     Place,
@@ -79,6 +84,7 @@ LEAN = np.radians(80.0)  # of the trunk on all fours
 # Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
 # its upper edge before it leans far enough for the weight to get past the other knee.
 BEFORE_RISER = 0.5
+OVER_MIDDLE = 3.0  # weight of the centre of mass between hands and feet
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
@@ -442,7 +448,7 @@ def _set_all(
                 here,
                 place,
                 body,
-                None,
+                _upright(task, key, here, surface, place),
                 shares=SHRUNK[:1],
                 imposed=False,
             )
@@ -454,6 +460,38 @@ def _set_all(
             made.append((key, path, _option_with(task, surface).name))
         wanted = left
     return made, why
+
+
+def _upright(
+    task: _Task, key: Keyframe, here: Contact | None, surface: str, place: Place
+) -> np.ndarray:
+    """(nq,) with a surface at its place, the weight between the hands and the feet.
+
+    What the postures on stairs stay near to: legs that come after the hands otherwise
+    push the body over them.
+    """
+    world = task.ik.world
+    new = _contact(world, surface, place, task.platforms[0].entry.yaw)
+    stance = [c for c in key.stance if here is None or c.surface != here.surface]
+    stance.append(new)
+    where = {c.surface: c.support for c in stance}
+    problem = PostureProblem(
+        goals=tuple(held_goal(world, c) for c in stance),
+        q_reference=key.q,
+        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where),
+        com_target=_middle(task, stance),
+        com_weight=OVER_MIDDLE,
+    )
+    return task.ik.solve(problem, key.q).q
+
+
+def _middle(task: _Task, stance: Sequence[Contact]) -> np.ndarray:
+    """(2,) half-way between the arms' contacts and the legs'."""
+    kinds: dict[bool, list[np.ndarray]] = {}
+    for c in stance:
+        arm = task.ik.world.robot.limb_of(c.surface).is_arm
+        kinds.setdefault(arm, []).append(c.position[:2])
+    return np.mean([np.mean(x, axis=0) for x in kinds.values()], axis=0)
 
 
 def _option_with(task: _Task, surface: str) -> Option:
