@@ -49,6 +49,7 @@ LAYERS = [
     "exploration",
     "checkup",
     "route",
+    "stairs",
     "traverse",
     "control",
     "terrain",

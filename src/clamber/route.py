@@ -83,7 +83,7 @@ def find_platforms(scene: Scene, goal: np.ndarray) -> tuple[Platform, ...]:
     start = scene.start[:2]
     met = []
     for box in scene.boxes:
-        crossed = _crossing(box.top, start, goal)
+        crossed = crossing(box.top, start, goal)
         if crossed is not None:
             met.append((*crossed, box.top))
     met.sort(key=lambda m: m[0])
@@ -127,10 +127,10 @@ def _sides(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return A, np.sum(A * corners, axis=1)
 
 
-def _crossing(
+def crossing(
     top: Support, start: np.ndarray, goal: np.ndarray
 ) -> tuple[float, float] | None:
-    """Shares of the way at which the line enters and leaves; None where it misses."""
+    """Shares of the way (2,) at which it enters and leaves a top; None: it misses it."""
     A, b = _sides(_corners(top))
     rate, room = A @ (goal - start), b - A @ start
     t0, t1 = 0.0, math.inf

@@ -41,7 +41,12 @@ from clamber.policy import (
     pelvis_distribution,
     pelvis_rotation,
 )
-from clamber.posture.ik import IK, PostureProblem
+from clamber.posture.ik import (
+    IK,
+    PostureProblem,
+    base_clearance,
+    contact_clearance,
+)
 from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal
 from clamber.route import (
     Place,
@@ -54,6 +59,7 @@ from clamber.route import (
 from clamber.scene import GROUND, Scene
 from clamber.se3 import matrix_from_quat, quat_from_matrix
 from clamber.search import home_at, plan_step, standing
+from clamber.stairs import FLUSH, Gait, is_flight, next_contacts
 
 STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
 TURN = 0.25  # [rad] of the body in one cycle on all fours
@@ -76,10 +82,10 @@ REACH = 0.65  # lengths of an arm that hands reach beyond a stand
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
 STRETCH = 0.57  # lengths of the trunk from the body's middle to hands or knees
 LEAN = np.radians(80.0)  # of the trunk on all fours
-FLUSH = 0.01  # [m] tops that differ by less are no stairs
 # Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
 # its upper edge before it leans far enough for the weight to get past the other knee.
 BEFORE_RISER = 0.5
+OVER_MIDDLE = 3.0  # weight of the centre of mass between hands and feet
 CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
@@ -133,6 +139,7 @@ class _Build:
         thigh: [m]
         stretch: Half of what it is stretched by on hands and knees [m].
         round: Radius of what the body takes up while it turns on all fours [m].
+        gait: On stairs.
     """
 
     step: dict[str, float]
@@ -145,6 +152,7 @@ class _Build:
     thigh: float
     stretch: float
     round: float
+    gait: Gait
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -303,7 +311,11 @@ def _manoeuvre(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
         feet = np.mean([c.position for c in grounded], axis=0)
         if platform.exit is not None and platform.exit.distance(feet) < 0:
             return _climb_down(task, key, platform)
-        return _climb_up(task, key, platform.entry, platform)
+        return _climb(task, key, platform)
+    if is_flight(task.ik.world, platform):
+        made, why = _up_stairs(task, key, platform)
+        if made or why:
+            return made, why
     return _on_fours(task, key, platform)
 
 
@@ -329,7 +341,7 @@ def _on_feet(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
             and abs(_apart(frame.yaw, wanted.yaw)) <= FACING
         )
         if near:
-            return _climb_up(task, key, ahead.entry, ahead)
+            return _climb(task, key, ahead)
         return _walk(task, key, frame, wanted)
     wanted = _Frame(task.goal, frame.yaw if task.goal_yaw is None else task.goal_yaw)
     if _there(frame, wanted):
@@ -408,6 +420,106 @@ def _ankles(task: _Task, body: _Frame) -> np.ndarray:
 
 
 # Up and down.
+
+
+def _climb(task: _Task, key: Keyframe, platform: Platform) -> tuple[list[_Made], str]:
+    """The next contacts of a flight of stairs, or all that is left of a climb."""
+    if is_flight(task.ik.world, platform):
+        return _up_stairs(task, key, platform)
+    return _climb_up(task, key, platform.entry, platform)
+
+
+def _up_stairs(
+    task: _Task, key: Keyframe, platform: Platform
+) -> tuple[list[_Made], str]:
+    """The next contacts, usually a pair; why there are none; neither where it is up.
+
+    Where not all of a pair get to their places, all go to their next best.
+    """
+    wanted = next_contacts(task.ik.world, platform, key.stance, task.build.gait)
+    some: list[_Made] = []
+    why = ""
+    for rank in range(max((len(places) for _, places in wanted), default=0)):
+        these = [(s, places[min(rank, len(places) - 1)]) for s, places in wanted]
+        made, why = _set_all(task, key, platform, these)
+        if not why:
+            return made, ""
+        some = some or made
+    return some, "" if some else why
+
+
+def _set_all(
+    task: _Task,
+    key: Keyframe,
+    platform: Platform,
+    wanted: Sequence[tuple[str, Place]],
+) -> tuple[list[_Made], str]:
+    """Surfaces set down at their places; why not the last of those that are not."""
+    body = _Frame(platform.entry.point, platform.entry.yaw)
+    limb_of = task.ik.world.robot.limb_of
+    made: list[_Made] = []
+    why = ""
+    for _ in range(2):  # what cannot move yet is tried again once the others have
+        left, why = [], ""
+        for surface, place in wanted:
+            here = _by_limb(task, key.stance).get(limb_of(surface).name)
+            found = _attempt(
+                task,
+                key,
+                surface,
+                here,
+                place,
+                body,
+                _upright(task, key, here, surface, place),
+                shares=SHRUNK[:1],
+                imposed=False,
+            )
+            if isinstance(found, str):
+                left.append((surface, place))
+                why = found
+                continue
+            key, path = found
+            made.append((key, path, _option_with(task, surface).name))
+        wanted = left
+    return made, why
+
+
+def _upright(
+    task: _Task, key: Keyframe, here: Contact | None, surface: str, place: Place
+) -> np.ndarray:
+    """(nq,) with a surface at its place, the weight between the hands and the feet.
+
+    What the postures on stairs stay near to: legs that come after the hands otherwise
+    push the body over them.
+    """
+    world = task.ik.world
+    new = _contact(world, surface, place, task.platforms[0].entry.yaw)
+    stance = [c for c in key.stance if here is None or c.surface != here.surface]
+    stance.append(new)
+    where = {c.surface: c.support for c in stance}
+    problem = PostureProblem(
+        goals=tuple(held_goal(world, c) for c in stance),
+        q_reference=key.q,
+        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where),
+        com_target=_middle(task, stance),
+        com_weight=OVER_MIDDLE,
+    )
+    return task.ik.solve(problem, key.q).q
+
+
+def _middle(task: _Task, stance: Sequence[Contact]) -> np.ndarray:
+    """(2,) half-way between the arms' contacts and the legs'."""
+    kinds: dict[bool, list[np.ndarray]] = {}
+    for c in stance:
+        arm = task.ik.world.robot.limb_of(c.surface).is_arm
+        kinds.setdefault(arm, []).append(c.position[:2])
+    return np.mean([np.mean(x, axis=0) for x in kinds.values()], axis=0)
+
+
+def _option_with(task: _Task, surface: str) -> Option:
+    """The first of the policy that moves a surface; else the last."""
+    options = task.policy.options
+    return next((o for o in options if surface in o.surfaces), options[-1])
 
 
 def _climb_up(
@@ -1255,18 +1367,34 @@ def _build(ik: IK, policy: GeneralPolicy) -> _Build:
     thigh = float(
         np.linalg.norm(kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1])
     )
+    feet = 0.5 * float(np.linalg.norm(soles[0] - soles[1]))
+    ahead = along.T @ (np.mean(soles, axis=0) - world.scene.start[:2])
+    stand, arm_step = STAND * leg, min(step[x.name] for x in arms)
+    sides = {}
+    for x in limbs:
+        y = fours[x.name][1]
+        sides |= dict.fromkeys(x.surfaces, float(y))
+        if not x.is_arm:
+            sides[x.surfaces[0]] = math.copysign(feet, y)
     return _Build(
         step=step,
         fours=fours,
-        feet=0.5 * float(np.linalg.norm(soles[0] - soles[1])),
-        ahead=along.T @ (np.mean(soles, axis=0) - world.scene.start[:2]),
-        stand=STAND * leg,
-        reach=STAND * leg + REACH * arm,
+        feet=feet,
+        ahead=ahead,
+        stand=stand,
+        reach=stand + REACH * arm,
         tall=leg + trunk + arm,
         thigh=thigh,
         stretch=STRETCH * trunk,
         # The shanks trail behind the knees.
         round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
+        gait=Gait(
+            lead=stand + DEPTH["hand"] * arm_step,
+            gap=arm_step,
+            knee=DEPTH["knee"] * min(step[x.name] for x in legs),
+            span=float(fours[arms[0].name][0] - fours[legs[0].name][0]),
+            sides=sides,
+        ),
     )
 
 

@@ -1,0 +1,189 @@
+"""A flight of stairs -> where hands, feet and knees go next, tread after tread.
+
+A robot that kneels on a narrow tread cannot get up the next riser: with one knee up, the
+thigh of the other meets the riser's upper edge before the weight is past the first. A
+foot that stays behind lets the body get past. So stairs are climbed on hands and feet,
+the hands as far ahead as on a box that is climbed from the ground, and the last riser is
+climbed like that box, on knees.
+
+Lengths along the flight count from the edge where it begins, inwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clamber.contact import Contact
+from clamber.model import Surface, World
+from clamber.policy import Edge
+from clamber.route import BORDER, Place, Platform, crossing
+
+FLUSH = 0.01  # [m] tops that differ by less are no stairs
+CLEAR = 0.02  # [m] between a surface and what is higher than its support
+FAR = 100.0  # [m] longer than any flight
+WORTH = 0.05  # [m] a limb that gets on by less stays where it is
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Gait:
+    """Where limbs go on stairs, as a robot's build has it.
+
+    Attributes:
+        lead: Hands are set down so far ahead of the feet [m].
+        gap: Feet come no nearer to the hands than this [m].
+        knee: Knees come so far behind the last edge [m].
+        span: From knees to hands at the end [m].
+        sides: Of each surface, to the left of the way [m].
+    """
+
+    lead: float
+    gap: float
+    knee: float
+    span: float
+    sides: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Spot:
+    """On which support, and how far along the flight [m]."""
+
+    support: str
+    x: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Tread:
+    """A tread that begins at `edge`, and where a surface's middle may be on it [m]."""
+
+    name: str
+    edge: float
+    low: float
+    high: float
+
+    def near(self, x: float) -> _Spot:
+        """The spot nearest to x."""
+        return _Spot(self.name, float(np.clip(x, self.low, self.high)))
+
+    def up_to(self, x: float) -> list[_Spot]:
+        """The farthest spot that is no farther than x, and the nearest one."""
+        if x < self.low:
+            return []
+        far = min(x, self.high)
+        return [_Spot(self.name, p) for p in dict.fromkeys((far, self.low))]
+
+
+def is_flight(world: World, platform: Platform) -> bool:
+    """Whether each box of a platform is higher than the one before it."""
+    tops = [world.supports[n].position[2] for n in platform.boxes]
+    return len(tops) > 1 and bool(np.all(np.diff(tops) > FLUSH))
+
+
+def next_contacts(
+    world: World, platform: Platform, stance: Sequence[Contact], gait: Gait
+) -> list[tuple[str, tuple[Place, ...]]]:
+    """The next surfaces to be set down, each with its places, the best one first.
+
+    Read off the stance alone: limbs without a contact; else both hands, where the feet
+    have come after them; else both feet; else, the feet before the last riser, the
+    knees. None where both knees are on the last tread.
+
+    Args:
+        world: Robot and scene.
+        platform: The flight.
+        stance: On the ground and the treads, or on some of them.
+        gait: Of the robot.
+    """
+    edge = platform.entry
+    left = np.array([-edge.inward[1], edge.inward[0]])
+    at = {world.robot.limb_of(c.surface).name: c for c in stance}
+    x = {limb: _along(world, edge, c) for limb, c in at.items()}
+    arms = [b for b in world.robot.limbs.values() if b.is_arm]
+    legs = [b for b in world.robot.limbs.values() if not b.is_arm]
+    on = [b for b in legs if b.name in at and at[b.name].surface == b.surfaces[0]]
+    if not on:
+        return []
+
+    def places(surface: str, spots: Sequence[_Spot]) -> tuple[str, tuple[Place, ...]]:
+        out = []
+        for s in spots:
+            p = edge.point + s.x * edge.inward + gait.sides[surface] * left
+            q = world.supports[s.support].project(np.array([*p, 0.0]))
+            out.append(Place(support=s.support, position=q))
+        return surface, tuple(out)
+
+    def treads(surface: str) -> list[_Tread]:
+        return _treads(world, platform, surface, gait.sides[surface])
+
+    behind = min(x[b.name] for b in on)
+    hands = []
+    for arm in arms:
+        hand = arm.surfaces[0]
+        room = treads(hand)
+        end = room[-1].edge + gait.knee + gait.span
+        spot = _nearest(room, min(behind + gait.lead, end))
+        firm = arm.name in at and at[arm.name].surface == hand
+        if not firm or (on == legs and spot.x - x[arm.name] >= WORTH):
+            hands.append(places(hand, [spot]))
+    lost = [b for b in legs if b.name not in at]
+    if lost:
+        other = on[0].name
+        spot = _Spot(at[other].support, x[other])
+        return [places(b.surfaces[0], [spot]) for b in lost]
+    if hands:
+        return hands
+    feet = []
+    before = min(x[b.name] for b in arms) - gait.gap
+    for leg in on if on == legs else ():
+        room = treads(leg.surfaces[0])
+        spots = [s for t in room[-2::-1] for s in t.up_to(before)]
+        spots = [s for s in spots if s.x - x[leg.name] >= WORTH]
+        if spots:
+            feet.append(places(leg.surfaces[0], spots))
+    if feet:
+        return feet
+    knees = [(b.surfaces[-1], treads(b.surfaces[-1])[-1]) for b in on]
+    return [places(k, [t.near(t.edge + gait.knee)]) for k, t in knees]
+
+
+def _along(world: World, edge: Edge, c: Contact) -> float:
+    """Of a contact's middle, from the edge inwards [m]."""
+    x = edge.distance(c.position)
+    # A foot on tiptoe is where its toes are.
+    return x if c.edge is None else x - _half(world.surfaces[c.surface])
+
+
+def _half(surface: Surface) -> float:
+    """Half the length of a flat surface, 0 of a ball [m]."""
+    if surface.rotation is None:
+        return 0.0
+    return 0.5 * float(np.ptp(surface.corners @ surface.rotation[:, 0]))
+
+
+def _treads(
+    world: World, platform: Platform, surface: str, side: float
+) -> list[_Tread]:
+    """The treads on which a surface finds room, `side` to the left of the way [m]."""
+    s, edge = world.surfaces[surface], platform.entry
+    half = _half(s)
+    start = edge.point + side * np.array([-edge.inward[1], edge.inward[0]])
+    start = start - edge.inward
+    met = []
+    for name in platform.boxes:
+        over = crossing(world.supports[name], start, start + FAR * edge.inward)
+        if over is not None:
+            met.append((name, FAR * over[0] - 1.0, FAR * over[1] - 1.0))
+    risers = [m[1] for m in met[1:]] + [np.inf]
+    out = []
+    for (name, begin, end), riser in zip(met, risers, strict=True):
+        low = begin + half + BORDER
+        high = min(end - half - BORDER, riser - max(s.radius, half) - CLEAR)
+        if low <= high:
+            out.append(_Tread(name, begin, low, high))
+    return out
+
+
+def _nearest(treads: Sequence[_Tread], x: float) -> _Spot:
+    return min((t.near(x) for t in treads), key=lambda s: abs(s.x - x))
