@@ -798,6 +798,23 @@ def _touching(
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Balls:
+    """Round surfaces that roll on supports, K of them, to be looked at together.
+
+    Attributes:
+        bodies: (K,) ids; centres: (K, 3, 1) in their frames; radii: (K, 1) [m].
+        normals: (K, 3) of the supports.
+        links: (K, 4) orientation of each link where its contact was taken.
+    """
+
+    bodies: np.ndarray
+    centres: np.ndarray
+    radii: np.ndarray
+    normals: np.ndarray
+    links: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proximity:
     """Pairs nearer than the range asked for.
 
@@ -955,6 +972,16 @@ class Kinematics:
         nx, ny, nz = normal.tolist()
         return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
 
+    def rolled(self, balls: Balls) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 3) `contact_point` and (K, 3) `roll` of all of them."""
+        R, n = self._xmat[balls.bodies], balls.normals
+        turns = np.empty((len(n), 3, 1))
+        for turn, body, link in zip(turns, balls.bodies, balls.links, strict=True):
+            mujoco.mju_subQuat(turn[:, 0], self._xquat[body], link)
+        p = self._xpos[balls.bodies] + (R @ balls.centres)[:, :, 0] - balls.radii * n
+        w = balls.radii * (R @ turns)[:, :, 0]
+        return p, w[:, _YZX] * n[:, _ZXY] - w[:, _ZXY] * n[:, _YZX]
+
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
         """(3,) world rotation vector from the surface's frame to the contact frame."""
         s = self.world.surfaces[surface]
@@ -1011,7 +1038,7 @@ class Kinematics:
     def _gaps(self) -> np.ndarray:
         """(P,) what bounding spheres, planes and boxes say that is between pairs."""
         x = self._geom_x - self._root
-        square = np.einsum("ij,ij->i", x, x)
+        square = (x * x) @ _ONES[:3]
         gap = square[:, None] + square - 2.0 * (x @ x.T)
         gap = np.sqrt(np.maximum(gap, 0.0)) - ROUNDING - self._spheres
         for plane in self._planes:
@@ -1019,16 +1046,16 @@ class Kinematics:
         for box in self._boxes:
             R = self._geom_R[box].reshape(3, 3)
             outside = np.abs((x - x[box]) @ R) - self._size[box]
-            outside = np.maximum(outside, 0.0)
-            away = np.sqrt(np.einsum("ij,ij->i", outside, outside)) - self._radius
+            outside = np.maximum(outside, 0.0) ** 2
+            away = np.sqrt(outside @ _ONES[:3]) - self._radius
             gap[box] = gap[:, box] = away
         return gap.ravel()[self._of_pair]
 
     def _moved(self) -> np.ndarray:
         """(P,) the most that pairs can have come nearer since this was last asked."""
         x, R = self._geom_x - self._seen_x, self._geom_R - self._seen_R
-        shift = np.sqrt(np.einsum("ij,ij->i", x, x))
-        way = shift + self._swing * np.sqrt(np.einsum("ij,ij->i", R, R)) + 1e-9
+        way = np.sqrt((x * x) @ _ONES[:3]) + 1e-9
+        way += self._swing * np.sqrt((R * R) @ _ONES)
         self._seen_x[:], self._seen_R[:] = self._geom_x, self._geom_R
         return way.take(self._first) + way.take(self._second)
 
@@ -1081,6 +1108,10 @@ class Kinematics:
         out = np.empty(m.nv)
         mujoco.mj_rne(m, d, 0, out)
         return out
+
+
+_ONES = np.ones(9)
+_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
