@@ -625,6 +625,7 @@ class IK:
                 self._goal_rows(goal)
             return
         kin, p, e, rows = self.kin, self._at, self._open, []
+        centre = p + held.offset
         sizes = (e[:, None] @ e[:, :, None]).ravel().tolist()
         room = held.b - (held.A @ p[:, :, None])[:, :, 0]
         near = room < EDGE_RANGE
@@ -650,7 +651,7 @@ class IK:
             for i, body, k, inside in rows:
                 kin.point_jacobian(body, p[i], self._hard.J[k])
                 if inside is not None:
-                    jac = kin.point_jacobian(body, p[i] + held.offset[i])
+                    jac = kin.point_jacobian(body, centre[i])
                     self._ineq.J[inside] = held.A[i, near[i]] @ jac
 
         self._later(fill)
@@ -957,7 +958,9 @@ class IK:
         self._ineq.lo[k] = -1e30
         middle = drawn = None
         if target is None and weight > 0:
-            middle = self._target(com - np.add.reduce(polygon, axis=0) / len(polygon), weight)
+            middle = self._target(
+                com - np.add.reduce(polygon, axis=0) / len(polygon), weight
+            )
         excess, gradient = 0.0, com
         if problem.ellipse_weight > 0:
             excess, gradient = ellipse_excess(polygon, com)
@@ -977,7 +980,8 @@ class IK:
         self._later(fill)
 
     def _distance_rows(self, clearance: np.ndarray, reach: float) -> None:
-        near = self.kin.proximity(reach, self._counted(clearance))
+        kin = self.kin
+        near = kin.proximity(reach, self._counted(clearance))
         if len(near.pairs) == 0:
             return
         short = clearance[near.pairs] - near.distance
@@ -985,7 +989,11 @@ class IK:
         k = self._ineq.take(len(short))
         self._ineq.lo[k] = short
         self._ineq.hi[k] = 1e30
-        self._later(lambda: self._pair_jacobian(near, self._ineq.J[k]))
+
+        def fill() -> None:
+            self._ineq.J[k] = kin.distance_jacobian(near.pairs, near.first, near.normal)
+
+        self._later(fill)
 
     def _counted(self, clearance: np.ndarray) -> np.ndarray:
         """(P,) bool: pairs that count; the same array for the same clearances."""
@@ -999,7 +1007,7 @@ class IK:
         The links in contact with it are as near as their contact is: of those, only
         what is known to have touched.
         """
-        w = self.world
+        w, kin = self.world, self.kin
         counts = self._counted(problem.clearance) & (self._rough > 0)
         for g in problem.goals:
             if g.hard:
@@ -1007,24 +1015,18 @@ class IK:
                 of_support = w.pairs == w.support_geom[g.support]
                 counts &= ~(of_link.any(axis=1) & of_support.any(axis=1)) | self._wary
         wanted = problem.clearance + self._rough
-        near = self.kin.proximity(float(wanted.max(initial=0.0, where=counts)), counts)
+        near = kin.proximity(float(wanted.max(initial=0.0, where=counts)), counts)
         short = np.maximum(wanted[near.pairs] - near.distance, 0.0)
         if not short.any():
             return
-        k = self._soft.take(len(short))
-        self._soft.lo[k] = -ROUGHNESS_WEIGHT * short
+        k = self._target(-short, ROUGHNESS_WEIGHT)
 
         def fill() -> None:
-            J = self._pair_jacobian(near, self._soft.J[k])
-            J *= ROUGHNESS_WEIGHT
+            J = kin.distance_jacobian(near.pairs, near.first, near.normal)
             J[short == 0.0] = 0.0
+            self._aim(k, J, ROUGHNESS_WEIGHT)
 
         self._later(fill)
-
-    def _pair_jacobian(self, near: Proximity, out: np.ndarray) -> np.ndarray:
-        """(m, nv) of the pairs' distances."""
-        out[:] = self.kin.distance_jacobian(near.pairs, near.first, near.normal)
-        return out
 
 
 def _held(
