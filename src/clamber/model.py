@@ -35,6 +35,10 @@ BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
 LOOK_RANGE = 0.12  # [m] to which distances are looked at, to know when to look again
 ROUNDING = 1e-6  # [m] by which squared distances may be wrong, near 0
 FEW_PAIRS = 40  # that are quicker looked at than bounded
+# Vector products are a[_YZX] b[_ZXY] - a[_ZXY] b[_YZX]: of a few rows, `np.cross` takes
+# five times as long.
+_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
+_ONES = np.ones(9)
 CLEAR = 0.002  # [m] that they keep from boxes at the start
 DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
 DEFAULT_DAMPING = 3.0  # [N m s/rad] where the description has none
@@ -798,6 +802,23 @@ def _touching(
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Balls:
+    """Round surfaces that roll on supports, K of them, to be looked at together.
+
+    Attributes:
+        bodies: (K,) ids; centres: (K, 3, 1) in their frames; radii: (K, 1) [m].
+        normals: (K, 3) of the supports.
+        links: (K, 4) orientation of each link where its contact was taken.
+    """
+
+    bodies: np.ndarray
+    centres: np.ndarray
+    radii: np.ndarray
+    normals: np.ndarray
+    links: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proximity:
     """Pairs nearer than the range asked for.
 
@@ -813,6 +834,17 @@ class Proximity:
     normal: np.ndarray
     first: np.ndarray
     second: np.ndarray
+
+
+def _nearer_than(near: Proximity, reach: float) -> Proximity:
+    keep = (near.distance < reach).nonzero()[0]
+    return Proximity(
+        pairs=near.pairs[keep],
+        distance=near.distance[keep],
+        normal=near.normal[keep],
+        first=near.first[keep],
+        second=near.second[keep],
+    )
 
 
 class Kinematics:
@@ -854,6 +886,15 @@ class Kinematics:
         self._least = np.full(len(world.pairs), -np.inf)
         self._seen_x, self._seen_R = np.zeros((m.ngeom, 3)), np.zeros((m.ngeom, 9))
         self._geom_x, self._geom_R = self.data.geom_xpos, self.data.geom_xmat
+        # What was asked for last, and the answer.
+        self._asked: tuple[float, np.ndarray | None] = (-np.inf, None)
+        self._near = Proximity(
+            pairs=np.zeros(0, dtype=int),
+            distance=np.zeros(0),
+            normal=np.zeros((0, 3)),
+            first=np.zeros((0, 3)),
+            second=np.zeros((0, 3)),
+        )
         # (nbody, nv): the dofs that move a body.
         self._moves = np.zeros((m.nbody, m.nv))
         for body in range(m.nbody):
@@ -955,6 +996,16 @@ class Kinematics:
         nx, ny, nz = normal.tolist()
         return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
 
+    def rolled(self, balls: Balls) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 3) `contact_point` and (K, 3) `roll` of all of them."""
+        R, n = self._xmat[balls.bodies], balls.normals
+        turns = np.empty((len(n), 3, 1))
+        for turn, body, link in zip(turns, balls.bodies, balls.links, strict=True):
+            mujoco.mju_subQuat(turn[:, 0], self._xquat[body], link)
+        p = self._xpos[balls.bodies] + (R @ balls.centres)[:, :, 0] - balls.radii * n
+        w = balls.radii * (R @ turns)[:, :, 0]
+        return p, w[:, _YZX] * n[:, _ZXY] - w[:, _ZXY] * n[:, _YZX]
+
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
         """(3,) world rotation vector from the surface's frame to the contact frame."""
         s = self.world.surfaces[surface]
@@ -965,12 +1016,16 @@ class Kinematics:
     def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
         """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them.
 
+        The same array asks for the same pairs: it must not be written to meanwhile.
         A pair is looked at only where neither its bounds nor its last distance, less
         what its geoms have moved since, say that it is farther.
         """
         m, d = self.world.model, self.data
-        least = self._least
-        least -= self._moved()
+        least, moved = self._least, self._moved()
+        if moved is None and active is self._asked[1] and reach <= self._asked[0]:
+            return _nearer_than(self._near, reach)
+        if moved is not None:
+            least -= moved
         idx = self._nearer(reach, active)
         if len(idx) > FEW_PAIRS:
             np.maximum(least, self._gaps(), out=least)
@@ -993,13 +1048,15 @@ class Kinematics:
         normal = (p[:, 3:] - p[:, :3]) / apart
         for i in touching.nonzero()[0]:
             normal[i] = self._touching_normal(idx[i])
-        return Proximity(
+        self._asked = reach, active
+        self._near = Proximity(
             pairs=idx,
             distance=distance,
             normal=normal,
             first=p[:, :3],
             second=p[:, 3:],
         )
+        return self._near
 
     def _nearer(self, reach: float, active: np.ndarray | None) -> np.ndarray:
         """Indices of the pairs that may be nearer than `reach` [m]."""
@@ -1011,7 +1068,7 @@ class Kinematics:
     def _gaps(self) -> np.ndarray:
         """(P,) what bounding spheres, planes and boxes say that is between pairs."""
         x = self._geom_x - self._root
-        square = np.einsum("ij,ij->i", x, x)
+        square = (x * x) @ _ONES[:3]
         gap = square[:, None] + square - 2.0 * (x @ x.T)
         gap = np.sqrt(np.maximum(gap, 0.0)) - ROUNDING - self._spheres
         for plane in self._planes:
@@ -1019,16 +1076,21 @@ class Kinematics:
         for box in self._boxes:
             R = self._geom_R[box].reshape(3, 3)
             outside = np.abs((x - x[box]) @ R) - self._size[box]
-            outside = np.maximum(outside, 0.0)
-            away = np.sqrt(np.einsum("ij,ij->i", outside, outside)) - self._radius
+            outside = np.maximum(outside, 0.0) ** 2
+            away = np.sqrt(outside @ _ONES[:3]) - self._radius
             gap[box] = gap[:, box] = away
         return gap.ravel()[self._of_pair]
 
-    def _moved(self) -> np.ndarray:
-        """(P,) the most that pairs can have come nearer since this was last asked."""
+    def _moved(self) -> np.ndarray | None:
+        """(P,) the most that pairs can have come nearer since this was last asked.
+
+        None where nothing has moved.
+        """
         x, R = self._geom_x - self._seen_x, self._geom_R - self._seen_R
-        shift = np.sqrt(np.einsum("ij,ij->i", x, x))
-        way = shift + self._swing * np.sqrt(np.einsum("ij,ij->i", R, R)) + 1e-9
+        if not (x.any() or R.any()):
+            return None
+        way = np.sqrt((x * x) @ _ONES[:3]) + 1e-9
+        way += self._swing * np.sqrt((R * R) @ _ONES)
         self._seen_x[:], self._seen_R[:] = self._geom_x, self._geom_R
         return way.take(self._first) + way.take(self._second)
 
@@ -1045,9 +1107,9 @@ class Kinematics:
             points: (m, 3) on one of the geoms, in the world.
             normals: (m, 3) from the first geom to the second.
         """
-        wrench = np.empty((len(pairs), 6))
-        wrench[:, :3] = _cross(points - self._root, normals)
-        wrench[:, 3:] = normals
+        arm = points - self._root
+        moment = arm[:, _YZX] * normals[:, _ZXY] - arm[:, _ZXY] * normals[:, _YZX]
+        wrench = np.concatenate([moment, normals], axis=1)
         return (wrench @ self._cdof.T) * self._pair_moves[pairs]
 
     def _touching_normal(self, pair: int) -> np.ndarray:
@@ -1081,14 +1143,6 @@ class Kinematics:
         out = np.empty(m.nv)
         mujoco.mj_rne(m, d, 0, out)
         return out
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(m, 3) vector products; `np.cross` costs five times as much on a few rows."""
-    out = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
-    return out
 
 
 def limb_lengths(kin: Kinematics) -> dict[str, float]:

@@ -256,13 +256,7 @@ class SupportEllipse:
             excess: d_com - s, negative inside, zero on the border [m].
             gradient: (2,) its derivative by x and y; a focus itself adds nothing.
         """
-        x, y = np.asarray(com, dtype=float)[:2].tolist()
-        total, gx, gy = -self.string_length, 0.0, 0.0
-        for fx, fy in self.foci.tolist():
-            d = math.hypot(x - fx, y - fy)
-            total += d
-            gx, gy = gx + (x - fx) / max(d, 1e-12), gy + (y - fy) / max(d, 1e-12)
-        return total, np.array([gx, gy])
+        return _excess(self.foci.tolist(), self.string_length, com)
 
 
 def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
@@ -276,24 +270,60 @@ def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
     the largest ellipse that fits at all. Collinear points give the segment, one point
     itself, as ellipses without area: no centre of mass has a negative excess there.
     """
+    (x, y), major, minor, (fx, fy) = _fit_ellipse(polygon)
+    return SupportEllipse(
+        centre=np.array([x, y]),
+        semi_axes=np.array([major, minor]),
+        foci=np.array([[x - fx, y - fy], [x + fx, y + fy]]),
+        string_length=2 * major,
+    )
+
+
+def ellipse_excess(polygon: np.ndarray, com: ArrayLike) -> tuple[float, np.ndarray]:
+    """`support_ellipse(polygon).excess(com)`, without the record."""
+    (x, y), major, _, (fx, fy) = _fit_ellipse(polygon)
+    return _excess([[x - fx, y - fy], [x + fx, y + fy]], 2 * major, com)
+
+
+def _excess(
+    foci: list[list[float]], string_length: float, com: ArrayLike
+) -> tuple[float, np.ndarray]:
+    x, y = np.asarray(com, dtype=float)[:2].tolist()
+    total, gx, gy = -string_length, 0.0, 0.0
+    for fx, fy in foci:
+        d = math.hypot(x - fx, y - fy)
+        total += d
+        gx, gy = gx + (x - fx) / max(d, 1e-12), gy + (y - fy) / max(d, 1e-12)
+    return total, np.array([gx, gy])
+
+
+_Pair = tuple[float, float]
+
+
+def _fit_ellipse(polygon: np.ndarray) -> tuple[_Pair, float, float, _Pair]:
+    """Centre, semi-axes and a focus, from the centre, of `support_ellipse`."""
     v = np.asarray(polygon, dtype=float).tolist()
     if not v:
         raise ValueError("a polygon without vertices has no ellipse")
-    mx, my = sum(x for x, _ in v) / len(v), sum(y for _, y in v) / len(v)
+    mx = my = 0.0
+    for x, y in v:
+        mx, my = mx + x, my + y
+    mx, my = mx / len(v), my / len(v)
     r = [(x - mx, y - my) for x, y in v]
     sides = list(zip(r, r[1:] + r[:1], strict=True))
-    area = 0.5 * sum(ax * by - ay * bx for (ax, ay), (bx, by) in sides)
-    if area <= 1e-12 * sum(x * x + y * y for x, y in r):
-        half = max(r, key=lambda p: p[0] * p[0] + p[1] * p[1])
-        return _ellipse((mx, my), math.hypot(*half), 0.0, half)
-    # First and second moments of area about the middle, triangle by triangle.
-    cx = cy = xx = xy = yy = 0.0
+    # Area, first and second moments about the middle, triangle by triangle.
+    area = square = cx = cy = xx = xy = yy = 0.0
     for (ax, ay), (bx, by) in sides:
         cross, sx, sy = ax * by - ay * bx, ax + bx, ay + by
+        area, square = area + cross, square + ax * ax + ay * ay
         cx, cy = cx + cross * sx, cy + cross * sy
         xx += cross * (ax * ax + bx * bx + sx * sx)
         xy += cross * (ax * ay + bx * by + sx * sy)
         yy += cross * (ay * ay + by * by + sy * sy)
+    area *= 0.5
+    if area <= 1e-12 * square:
+        half = max(r, key=lambda p: p[0] * p[0] + p[1] * p[1])
+        return (mx, my), math.hypot(*half), 0.0, half
     cx, cy = cx / (6 * area), cy / (6 * area)
     xx, xy, yy = (m / (24 * area) for m in (xx, xy, yy))
     xx, xy, yy = xx - cx * cx, xy - cx * cy, yy - cy * cy
@@ -307,21 +337,8 @@ def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
     angle = 0.5 * math.atan2(2 * xy, xx - yy)
     major, minor = math.sqrt(k * (half + skew)), math.sqrt(k * max(half - skew, 0.0))
     focal = math.sqrt(max(major * major - minor * minor, 0.0))
-    way = (focal * math.cos(angle), focal * math.sin(angle))
-    return _ellipse((mx + cx, my + cy), major, minor, way)
-
-
-def _ellipse(
-    centre: tuple[float, float], major: float, minor: float, focus: tuple[float, float]
-) -> SupportEllipse:
-    """The ellipse with these semi-axes; `focus` is from the centre."""
-    (x, y), (fx, fy) = centre, focus
-    return SupportEllipse(
-        centre=np.array([x, y]),
-        semi_axes=np.array([major, minor]),
-        foci=np.array([[x - fx, y - fy], [x + fx, y + fy]]),
-        string_length=2 * major,
-    )
+    focus = (focal * math.cos(angle), focal * math.sin(angle))
+    return (mx + cx, my + cy), major, minor, focus
 
 
 # Forces.

@@ -29,13 +29,13 @@ import mujoco
 import numpy as np
 
 from clamber.errors import Status
-from clamber.model import Kinematics, Proximity, Surface, World
+from clamber.model import Balls, Kinematics, Proximity, Surface, World
 from clamber.scene import Support
 from clamber.se3 import frame_from_normal, matrix_from_quat, rotation_vector
 from clamber.statics import (
     com_margin,
+    ellipse_excess,
     polygon_halfplanes,
-    support_ellipse,
     support_polygon,
 )
 
@@ -281,6 +281,30 @@ class QP:
     merit: float
 
 
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Held:
+    """Goals of a problem that are looked at together: round contacts in their places.
+
+    Attributes:
+        of_goal: Which of the K each goal is, None for the others.
+        balls: All of them.
+        bodies: Of each.
+        offset: (K, 3) from the contact to the centre.
+        position: (K, 3) where they hold.
+        A, b: (K, m, 3), (K, m) half-planes that they stay in, on their supports.
+        bears: (n,) those that bear load; None where other goals do as well.
+    """
+
+    of_goal: list[int | None]
+    balls: Balls
+    bodies: list[int]
+    offset: np.ndarray
+    position: np.ndarray
+    A: np.ndarray
+    b: np.ndarray
+    bears: list[int] | None
+
+
 class IK:
     """Workspace of the solver: one per world, used again for every posture."""
 
@@ -324,6 +348,10 @@ class IK:
             self._wary |= mine
         self._is_rough = bool(self._rough.any())
         self._clearance = self._counts = np.zeros(0)
+        self._motion = np.zeros((0, 3, nv))
+        self._problem: PostureProblem | None = None
+        self._held: _Held | None = None
+        self._at = self._open = np.zeros((0, 3))
 
     def build(
         self, problem: PostureProblem, q: np.ndarray, reach: float = ACTIVE_RANGE
@@ -348,8 +376,8 @@ class IK:
         self._soft.n = self._hard.n = self._ineq.n = 0
         self._violation = 0.0
         self._fills.clear()
-        for goal in problem.goals:
-            self._goal_rows(goal)
+        self._look(problem)
+        self._contact_rows(problem)
         self._direction_rows(problem)
         if problem.base_rotation is not None and problem.base_weight > 0:
             self._base_rows(problem.base_rotation, problem.base_weight)
@@ -528,6 +556,7 @@ class IK:
         """Recompute everything from the model at `q`."""
         kin, w = self.kin, self.world
         kin.update(q)
+        self._look(problem)
         contact = 0.0
         for g in problem.goals:
             if not g.hard:
@@ -556,7 +585,7 @@ class IK:
         near = kin.proximity(reach, finite)
         short = problem.clearance[near.pairs] - near.distance
         worst = int(np.argmax(short)) if len(short) else -1
-        _, points = self._bearing(problem)
+        points = self._bearing(problem)[1]
         margin = (
             com_margin(kin.com[:2], support_polygon(points[:, :2]))
             if len(points)
@@ -579,6 +608,53 @@ class IK:
 
     # Rows, one method for each kind of task. What a row asks for is put down at once; its
     # Jacobian is left to a function that `_linearise` calls where it is needed.
+
+    def _look(self, problem: PostureProblem) -> None:
+        """Where the held round contacts of this problem are, all of them at once."""
+        if problem is not self._problem:
+            self._problem = problem
+            self._held = _held(self.world, problem.goals, self._insets)
+        if self._held is not None:
+            self._at, roll = self.kin.rolled(self._held.balls)
+            self._open = self._held.position + roll - self._at
+
+    def _contact_rows(self, problem: PostureProblem) -> None:
+        held = self._held
+        if held is None:
+            for goal in problem.goals:
+                self._goal_rows(goal)
+            return
+        kin, p, e, rows = self.kin, self._at, self._open, []
+        centre = p + held.offset
+        sizes = (e[:, None] @ e[:, :, None]).ravel().tolist()
+        room = held.b - (held.A @ p[:, :, None])[:, :, 0]
+        near = room < EDGE_RANGE
+        least = room.min(axis=1).tolist()
+        for goal, i in zip(problem.goals, held.of_goal, strict=True):
+            if i is None:
+                self._goal_rows(goal)
+                continue
+            k = self._hard.take(3)
+            self._hard.lo[k] = e[i]
+            self._violation += sizes[i]
+            if least[i] < 0.0:
+                self._violation += _size(np.minimum(room[i], 0.0))
+            inside = None
+            if least[i] < EDGE_RANGE:
+                hi = room[i, near[i]]
+                inside = self._ineq.take(len(hi))
+                self._ineq.hi[inside] = hi
+                self._ineq.lo[inside] = -1e30
+            rows.append((i, held.bodies[i], k, inside))
+
+        def fill() -> None:
+            for i, body, k, inside in rows:
+                kin.point_jacobian(body, p[i], self._hard.J[k])
+                if inside is not None:
+                    jac = kin.point_jacobian(body, centre[i])
+                    self._ineq.J[inside] = held.A[i, near[i]] @ jac
+
+        self._later(fill)
 
     def _goal_rows(self, g: ContactGoal) -> None:
         s, support = self.world.surfaces[g.surface], self.world.supports[g.support]
@@ -632,16 +708,15 @@ class IK:
     def _round_rows(
         self, g: ContactGoal, s: Surface, p: np.ndarray, n: np.ndarray
     ) -> None:
-        """A round surface in its place, or rolled from there."""
+        """A round surface in its place that does not roll.
+
+        It touches under its centre: it moves as that does.
+        """
         kin, k, centre = self.kin, self._hard.take(3), p + s.radius * n
-        e = g.position + kin.roll(g.surface, n, g.link) - p
+        e = g.position - p
         self._hard.lo[k] = e
         self._violation += _size(e)
-        # One that does not roll touches under its centre: it moves as that does.
-        at = centre if g.link is None else p
-        self._later(lambda: kin.point_jacobian(s.body, at, self._hard.J[k]))
-        if g.link is not None:
-            self._inside(g.support, p, s.body, centre)
+        self._later(lambda: kin.point_jacobian(s.body, centre, self._hard.J[k]))
 
     def _rolling_rows(
         self, g: ContactGoal, s: Surface, p: np.ndarray, n: np.ndarray
@@ -722,12 +797,10 @@ class IK:
         """Keep `p` on its support; it moves as the body's point at `moves` does."""
         A, b = self._insets[support]
         room = b - A @ p
-        least = room.min()
-        if least >= EDGE_RANGE:
-            return
-        if least < 0.0:
-            self._violation += _size(np.minimum(room[room < EDGE_RANGE], 0.0))
         near = room < EDGE_RANGE
+        if not near.any():
+            return
+        self._violation += _size(np.minimum(room[near], 0.0))
         k = self._ineq.take(int(np.count_nonzero(near)))
         self._ineq.hi[k] = room[near]
         self._ineq.lo[k] = -1e30
@@ -804,32 +877,37 @@ class IK:
 
     def _bearing(
         self, problem: PostureProblem
-    ) -> tuple[list[tuple[int, np.ndarray] | None], np.ndarray]:
+    ) -> tuple[Sequence[int | None], np.ndarray, np.ndarray]:
         """The points (n, 3) that bear load, and what moves each of them.
 
-        What moves a point is a body and, relative to the point, the place on it that
-        moves alike: a ball's contact stays under its centre. None where it stays put.
+        A body moves it, None where it stays put, as it moves what is at the last array:
+        a ball's contact stays under its centre.
         """
-        movers: list[tuple[int, np.ndarray] | None] = []
-        points = []
+        held = self._held
+        if held is not None and held.bears is not None:
+            p = self._at[held.bears]
+            return [held.bodies[i] for i in held.bears], p, p + held.offset[held.bears]
+        bodies: list[int | None] = []
+        points, centres = [], []
         for g in problem.goals:
             if not (g.hard and g.loaded):
                 continue
             n = self.world.supports[g.support].normal
             p = self.kin.bearing_points(g.surface, n, g.edge)
             s = self.world.surfaces[g.surface]
-            still = s.is_flat and not g.free
-            movers += [None if still else (s.body, s.radius * n)] * len(p)
+            bodies += [None if s.is_flat and not g.free else s.body] * len(p)
             points.append(p)
-        return movers, np.concatenate(points) if points else np.zeros((0, 3))
+            centres.append(p + s.radius * n)
+        if not points:
+            return bodies, np.zeros((0, 3)), np.zeros((0, 3))
+        return bodies, np.concatenate(points), np.concatenate(centres)
 
     def _polygon_motion(
         self,
         A: np.ndarray,
         polygon: np.ndarray,
         com: np.ndarray,
-        movers: list[tuple[int, np.ndarray] | None],
-        points: np.ndarray,
+        bearing: tuple[Sequence[int | None], np.ndarray, np.ndarray],
         rows: np.ndarray,
     ) -> None:
         """Let the polygon's edges move with contacts that slide or roll.
@@ -837,26 +915,27 @@ class IK:
         The distance of c from the line through p and q changes by
         n'((1 - t) dp + t dq - dc), t the share of the edge at which c lies abreast.
         """
-        corners = polygon.tolist()
-        x, y = com.tolist()
+        bodies, points, centres = bearing
+        corners, (x, y) = polygon.tolist(), com.tolist()
         places = points[:, :2].tolist()
-        moves = []
-        for cx, cy in corners:
-            gaps = [abs(cx - px) + abs(cy - py) for px, py in places]
+        if len(self._motion) < len(corners):
+            self._motion = np.zeros((len(corners), *self._motion.shape[1:]))
+        moves, shares = self._motion[: len(corners)], []
+        for move, a, b in zip(moves, corners, [*corners[1:], corners[0]], strict=True):
+            (ax, ay), (bx, by) = a, b
+            gaps = [abs(ax - px) + abs(ay - py) for px, py in places]
             o = gaps.index(min(gaps))
-            mover = movers[o]
-            if mover is None:
-                moves.append(None)
-                continue
-            body, offset = mover
-            moves.append(self.kin.point_jacobian(body, points[o] + offset)[:2].copy())
-        for i, (ax, ay) in enumerate(corners):
-            j = (i + 1) % len(corners)
-            ex, ey = corners[j][0] - ax, corners[j][1] - ay
-            t = ((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey)
-            for move, share in ((moves[i], 1.0 - t), (moves[j], t)):
-                if move is not None:
-                    rows[i] -= (share * A[i]) @ move
+            body = bodies[o]
+            if body is None:
+                move[:] = 0.0
+            else:
+                self.kin.point_jacobian(body, centres[o], move)
+            ex, ey = bx - ax, by - ay
+            shares.append(((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey))
+        t = np.array(shares)[:, None]
+        following = np.concatenate([moves[1:, :2], moves[:1, :2]])
+        rows -= (((1.0 - t) * A)[:, None] @ moves[:, :2])[:, 0]
+        rows -= ((t * A)[:, None] @ following)[:, 0]
 
     def _balance_rows(self, problem: PostureProblem) -> None:
         kin, com = self.kin, self.kin.com[:2].copy()
@@ -866,8 +945,9 @@ class IK:
             self._later(lambda: self._aim(aimed, kin.com_jacobian()[:2], weight))
         if not problem.balance:
             return
-        movers, points = self._bearing(problem)
-        if not movers:
+        bearing = self._bearing(problem)
+        bodies, points, _ = bearing
+        if not bodies:
             return
         polygon = support_polygon(points[:, :2])
         A, b = polygon_halfplanes(polygon)
@@ -878,10 +958,12 @@ class IK:
         self._ineq.lo[k] = -1e30
         middle = drawn = None
         if target is None and weight > 0:
-            middle = self._target(com - polygon.mean(axis=0), weight)
+            middle = self._target(
+                com - np.add.reduce(polygon, axis=0) / len(polygon), weight
+            )
         excess, gradient = 0.0, com
         if problem.ellipse_weight > 0:
-            excess, gradient = support_ellipse(polygon).excess(com)
+            excess, gradient = ellipse_excess(polygon, com)
         if excess > 0:
             drawn = self._target(np.array([excess]), problem.ellipse_weight)
 
@@ -892,14 +974,14 @@ class IK:
                 self._aim(middle, J, weight)
             if drawn is not None:
                 self._aim(drawn, (gradient @ J)[None], problem.ellipse_weight)
-            if len(polygon) == len(b) and any(movers):
-                rows = self._ineq.J[k]
-                self._polygon_motion(A, polygon, com, movers, points, rows)
+            if len(polygon) == len(b) and any(bodies):
+                self._polygon_motion(A, polygon, com, bearing, self._ineq.J[k])
 
         self._later(fill)
 
     def _distance_rows(self, clearance: np.ndarray, reach: float) -> None:
-        near = self.kin.proximity(reach, self._counted(clearance))
+        kin = self.kin
+        near = kin.proximity(reach, self._counted(clearance))
         if len(near.pairs) == 0:
             return
         short = clearance[near.pairs] - near.distance
@@ -907,7 +989,11 @@ class IK:
         k = self._ineq.take(len(short))
         self._ineq.lo[k] = short
         self._ineq.hi[k] = 1e30
-        self._later(lambda: self._pair_jacobian(near, self._ineq.J[k]))
+
+        def fill() -> None:
+            self._ineq.J[k] = kin.distance_jacobian(near.pairs, near.first, near.normal)
+
+        self._later(fill)
 
     def _counted(self, clearance: np.ndarray) -> np.ndarray:
         """(P,) bool: pairs that count; the same array for the same clearances."""
@@ -921,7 +1007,7 @@ class IK:
         The links in contact with it are as near as their contact is: of those, only
         what is known to have touched.
         """
-        w = self.world
+        w, kin = self.world, self.kin
         counts = self._counted(problem.clearance) & (self._rough > 0)
         for g in problem.goals:
             if g.hard:
@@ -929,24 +1015,61 @@ class IK:
                 of_support = w.pairs == w.support_geom[g.support]
                 counts &= ~(of_link.any(axis=1) & of_support.any(axis=1)) | self._wary
         wanted = problem.clearance + self._rough
-        near = self.kin.proximity(float(wanted.max(initial=0.0, where=counts)), counts)
+        near = kin.proximity(float(wanted.max(initial=0.0, where=counts)), counts)
         short = np.maximum(wanted[near.pairs] - near.distance, 0.0)
         if not short.any():
             return
-        k = self._soft.take(len(short))
-        self._soft.lo[k] = -ROUGHNESS_WEIGHT * short
+        k = self._target(-short, ROUGHNESS_WEIGHT)
 
         def fill() -> None:
-            J = self._pair_jacobian(near, self._soft.J[k])
-            J *= ROUGHNESS_WEIGHT
+            J = kin.distance_jacobian(near.pairs, near.first, near.normal)
             J[short == 0.0] = 0.0
+            self._aim(k, J, ROUGHNESS_WEIGHT)
 
         self._later(fill)
 
-    def _pair_jacobian(self, near: Proximity, out: np.ndarray) -> np.ndarray:
-        """(m, nv) of the pairs' distances."""
-        out[:] = self.kin.distance_jacobian(near.pairs, near.first, near.normal)
-        return out
+
+def _held(
+    world: World,
+    goals: Sequence[ContactGoal],
+    insets: Mapping[str, tuple[np.ndarray, np.ndarray]],
+) -> _Held | None:
+    """Those goals that are round contacts in their places; None: there are none."""
+    of_goal: list[int | None] = [None] * len(goals)
+    held: list[tuple[ContactGoal, Surface, Support, np.ndarray]] = []
+    for i, g in enumerate(goals):
+        s = world.surfaces[g.surface]
+        if g.hard and not g.free and not s.is_flat and g.link is not None:
+            of_goal[i] = len(held)
+            held.append((g, s, world.supports[g.support], g.link))
+    if not held:
+        return None
+    radii = np.array([[s.radius] for _, s, _, _ in held])
+    normals = np.array([support.normal for _, _, support, _ in held])
+    bodies = [s.body for _, s, _, _ in held]
+    planes = [insets[g.support] for g, _, _, _ in held]
+    m = max(len(b) for _, b in planes)
+    A, b = np.zeros((len(held), m, 3)), np.full((len(held), m), np.inf)
+    for i, (normal, bound) in enumerate(planes):
+        A[i, : len(bound)], b[i, : len(bound)] = normal, bound
+    others = [g for g, i in zip(goals, of_goal, strict=True) if i is None]
+    alone = not any(g.hard and g.loaded for g in others)
+    return _Held(
+        of_goal=of_goal,
+        balls=Balls(
+            bodies=np.array(bodies),
+            centres=np.array([s.centre for _, s, _, _ in held])[:, :, None],
+            radii=radii,
+            normals=normals,
+            links=np.array([link for _, _, _, link in held]),
+        ),
+        bodies=bodies,
+        offset=radii * normals,
+        position=np.array([g.position for g, _, _, _ in held]),
+        A=A,
+        b=b,
+        bears=[i for i, x in enumerate(held) if x[0].loaded] if alone else None,
+    )
 
 
 def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
