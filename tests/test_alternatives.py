@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from clamber import alternatives, cli
+from clamber import alternatives, cli, search
 from clamber.alternatives import (
     Ranked,
     contact_alternatives,
@@ -19,6 +19,7 @@ from clamber.alternatives import (
     plan_or_replan,
     replan,
     replan_rest,
+    stand_ins,
     steps_made,
 )
 from clamber.contact import Contact, ContactSequence, Stance
@@ -129,6 +130,42 @@ def test_a_surface_that_the_robot_has_not_is_no_choice(coman):
 # Cost and rank.
 
 
+ON_HANDS = ("LFoot RFoot", "LFoot RFoot LHand", "RFoot LHand RHand LKnee")
+
+
+def test_elbows_stand_in_for_hands_both_before_one(coman):
+    found = stand_ins(sequence_of(*ON_HANDS), coman)
+    assert [set(a.surfaces) for a in found] == [
+        {"LElbow", "RElbow"},
+        {"LElbow", "RHand"},
+        {"LHand", "RElbow"},
+    ]
+    both = found[0].sequence
+    assert [set(s.surfaces) for s in both.stances] == [
+        {"LFoot", "RFoot"},
+        {"LFoot", "RFoot", "LElbow"},
+        {"RFoot", "LElbow", "RElbow", "LKnee"},
+    ]
+    for a, b in zip(both.stances, sequence_of(*ON_HANDS).stances, strict=True):
+        for c, d in zip(a.contacts, b.contacts, strict=True):
+            assert np.array_equal(c.position, d.position)
+
+
+def test_an_elbow_that_is_demonstrated_is_no_stand_in(coman):
+    assert stand_ins(sequence_of(*EXAMPLE), coman) == ()
+    one = ("LFoot RFoot", "LFoot RFoot LHand RHand", "LFoot RFoot LElbow RHand")
+    assert [a.surfaces for a in stand_ins(sequence_of(*one), coman)] == [("RElbow",)]
+
+
+def test_hands_that_stay_on_the_ground_have_no_stand_ins(coman):
+    sequence = sequence_of(*ON_HANDS)
+    ground = [
+        replace(s, contacts=tuple(replace(c, support="ground") for c in s.contacts))
+        for s in sequence.stances
+    ]
+    assert stand_ins(replace(sequence, stances=tuple(ground)), coman) == ()
+
+
 def test_the_cost_is_the_way_to_each_contact_and_its_projected_distance(demo_plan):
     world, kin, expected = demo_plan.world, Kinematics(demo_plan.world), 0.0
     for before, after, path in zip(
@@ -234,7 +271,13 @@ def failing(demo_plan, monkeypatch):
             if not all(used & set(s.split("|")) for s in surfaces):
                 return demo_plan
             why = Skipped(stance=3, reason="too high", missed=True)
-            return replace(demo_plan, complete=False, skipped=(why,))
+            return replace(
+                demo_plan,
+                complete=False,
+                skipped=(why,),
+                keyframes=demo_plan.keyframes[:1],
+                paths=(),
+            )
 
         monkeypatch.setattr(alternatives, "plan", stub)
         return asked
@@ -268,7 +311,7 @@ def test_where_nothing_is_found_it_says_what_was_tried(failing, demo_sequence, c
 def test_contacts_without_alternatives_are_planned_once(failing, demo_sequence, coman):
     """The only combination is the demonstrated one, which has just failed."""
     asked = failing("LFoot")
-    bare = alternatives.without_surfaces(demo_sequence, {"LElbow", "RElbow"})
+    bare = alternatives.without_surfaces(demo_sequence, {"LHand", "RHand"})
     scene = Scene.from_height(0.275)
     found = plan_or_replan(bare, coman, scene, bounds=Bounds(tries=0))
     assert found.instead.endswith("there is no alternative")
@@ -289,6 +332,51 @@ def test_where_no_alternative_is_stable_the_search_takes_over(
     assert again.instead == found.instead
     steps = split_moves(again.sequence, again.world)[0]
     assert [s.move.makes.surface for s in steps] == made
+
+
+def on_hands(demo_sequence):
+    return alternatives.without_surfaces(demo_sequence, {"LElbow", "RElbow"})
+
+
+def test_where_hands_fail_elbows_take_their_place(failing, demo_sequence, coman):
+    failing("LHand")
+    found = plan_or_replan(on_hands(demo_sequence), coman, Scene.from_height(0.2))
+    assert found.complete
+    assert found.instead.endswith("of the alternatives: LElbow, RElbow")
+    made = [p.transition.move.makes.surface for p in found.paths]
+    assert made == ["LElbow", "RElbow", "LKnee", "RKnee"]
+
+
+def test_the_search_goes_on_from_where_the_farthest_alternative_is_stuck(
+    failing, demo_sequence, coman, monkeypatch
+):
+    """Nobody gets the right knee up."""
+    failing("LHand")
+    plain, begun = search.plan_step, []
+
+    def no_right_knee(ik, before, step, *rest):
+        if step.move.makes is not None and step.move.makes.surface == "RKnee":
+            return "sore"
+        return plain(ik, before, step, *rest)
+
+    def explore(ik, goal, options, counts, bounds, *, start, report):
+        begun.append([] if start is None else start.steps)
+        return Explored(
+            keyframes=(),
+            paths=(),
+            sequence=None,
+            states=1,
+            tries=1,
+            stop=Stop.EXHAUSTED,
+        )
+
+    monkeypatch.setattr(search, "plan_step", no_right_knee)
+    monkeypatch.setattr(alternatives, "explore", explore)
+    found = plan_or_replan(on_hands(demo_sequence), coman, Scene.from_height(0.2))
+    assert not found.complete
+    farthest, anew = begun
+    assert [s.move.limb for s in farthest] == ["left_arm", "right_arm", "left_leg"]
+    assert anew == []
 
 
 @pytest.mark.slow
@@ -429,7 +517,7 @@ def test_the_rest_that_was_searched_for_is_counted_from_standing(
     def explore(ik, sequence, options, counts, bounds, *, start, report):
         stances = [Stance(contacts=k.stance) for k in demo_plan.keyframes[3:]]
         return Explored(
-            keyframes=(start, *demo_plan.keyframes[4:]),
+            keyframes=(*start.keyframes, *demo_plan.keyframes[4:]),
             paths=demo_plan.paths[3:],
             sequence=replace(
                 sequence, stances=tuple(stances), t=np.arange(len(stances) + 1.0)

@@ -13,6 +13,7 @@ from clamber.contact import region_of
 from clamber.errors import InputError
 from clamber.exploration import (
     Bounds,
+    Reached,
     Stop,
     action_counts,
     explore,
@@ -54,6 +55,7 @@ def tried(monkeypatch):
 
 def search(ik, goal, counts=None, start=None, **bounds):
     counts = action_counts(goal, ik.world) if counts is None else counts
+    start = None if start is None else Reached(keyframes=(start,))
     return explore(ik, goal, PlanOptions(), counts, Bounds(**bounds), start=start)
 
 
@@ -224,6 +226,41 @@ def test_no_sequence_is_longer_than_allowed(ik, goal, demo_plan, monkeypatch):
     monkeypatch.setattr(exploration, "plan_step", lambda *a: (key, path))
     ended = search(ik, goal, tries=10_000, depth=2)
     assert ended.stop is Stop.EXHAUSTED
+
+
+def test_what_is_gone_on_from_is_part_of_what_is_found(ik, goal, demo_plan):
+    """Five steps are made: one more gets there, and that is all that depth counts."""
+    steps = tuple(split_moves(goal, ik.world)[0][:5])
+    made = Reached(
+        keyframes=demo_plan.keyframes[:6], paths=demo_plan.paths[:5], steps=steps
+    )
+    counts = action_counts(goal, ik.world)
+    ended = explore(
+        ik, goal, PlanOptions(), counts, Bounds(tries=20, depth=1), start=made
+    )
+    assert ended.stop is Stop.FOUND
+    assert len(ended.paths) == 6
+    assert ended.keyframes[:6] == demo_plan.keyframes[:6]
+    again = split_moves(ended.sequence, ik.world)[0]
+    surfaces = [s.move.makes.surface for s in again]
+    assert surfaces[:5] == [s.move.makes.surface for s in steps]
+    assert surfaces[5] == "RKnee"
+
+
+def test_the_last_step_to_the_feet_rises_and_no_other_does(ik, goal, monkeypatch):
+    """A robot on its feet and one hand on the box has only to let go."""
+    upright, feet = standing_on_box(goal, ik.world)
+    hand = next(c for s in goal.stances for c in s.contacts if c.surface == "LHand")
+    key = standing(ik, PlanOptions().keyframe)
+    states = [replace(key.contacts[0], contact=c) for c in (*feet, hand)]
+    steps = []
+    monkeypatch.setattr(
+        exploration, "plan_step", lambda ik, key, step, *rest: steps.append(step) or ""
+    )
+    search(ik, upright, start=replace(key, contacts=tuple(states)), tries=1000)
+    assert any(s.move.makes is None for s in steps)
+    for s in steps:
+        assert s.rises == (s.move.makes is None)
 
 
 @pytest.mark.parametrize("name", ["tries", "depth"])

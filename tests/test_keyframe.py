@@ -22,6 +22,7 @@ from clamber.posture.keyframe import (
     contact_state,
     equilibrium_at,
     finish,
+    holding_limits,
     holds,
     keyframe_problem,
     new_positions,
@@ -487,3 +488,16 @@ def test_what_holds_is_what_the_margin_says(ik, results, share):
     kin.update(k.q)
     assert holds(kin, k.stance) == equilibrium_at(kin, k.stance).feasible
     assert holds(kin, k.stance) == (share >= 0.3)
+
+
+def test_holding_leaves_weak_joints_what_a_misplaced_contact_costs():
+    """A quarter of the weight 16 mm off: little to a knee, much to a wrist."""
+    world = build_world(load_robot("coman29"), Scene.from_height(0.275))
+    limits = dict(zip(world.joints, holding_limits(world), strict=True))
+    efforts = dict(zip(world.joints, world.tau_max, strict=True))
+    cost = 0.25 * 0.016 * world.mass * 9.81
+    for name, limit in limits.items():
+        assert limit == pytest.approx(0.9 * efforts[name] - cost)
+    assert min(limits.values()) < 0.7 * 5.0
+    weak = replace(world, tau_max=0.01 * world.tau_max)
+    assert np.all(holding_limits(weak) == 0.25 * weak.tau_max)

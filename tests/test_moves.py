@@ -232,6 +232,15 @@ def test_moves_done_in_order_lead_from_stance_to_stance(world, seed):
         assert np.linalg.norm(c.position - down[name].position) < SAME_PLACE
 
 
+@pytest.mark.parametrize(
+    ("last", "rises"), [("LFoot RFoot", True), ("LKnee RFoot", False)]
+)
+def test_a_step_that_ends_on_the_feet_rises_if_it_is_the_last(world, last, rises):
+    stances = ("LFoot RFoot", "LHand RHand LFoot RFoot", "RHand LFoot RFoot", last)
+    steps = split_moves(sequence(*stances), world)[0]
+    assert [s.rises for s in steps] == [False] * (len(steps) - 1) + [rises]
+
+
 def test_a_move_says_what_it_does():
     move = Move(limb="left_arm", breaks=("LHand",), makes=contact("LElbow"))
     assert str(move) == "LHand -> LElbow on box"

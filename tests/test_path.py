@@ -279,6 +279,17 @@ def test_an_open_contact_is_refused(demo_plan, ik):
     assert note == "a contact opens by 30 mm (shift)"
 
 
+def test_a_swing_that_weak_joints_do_not_hold_is_refused(demo_plan, ik):
+    """What the contacts that stay ask of the joints half-way, not at the ends alone."""
+    path = demo_plan.paths[-1]
+    assert check_phases(ik, path.phases, path.transition)[0] is Status.SOLVED
+    weak = IK(replace(ik.world, tau_max=0.1 * ik.world.tau_max))
+    status, _ = check_phases(weak, path.phases, path.transition)
+    assert status is Status.OVERLOADED
+    ends = tuple(p for p in path.phases if p.kind != "swing")
+    assert check_phases(weak, ends, path.transition)[0] is Status.SOLVED
+
+
 def test_overlap_is_the_depth_that_mujoco_measures(demo_plan, ik):
     world, q = demo_plan.world, demo_plan.keyframes[0].q.copy()
     q[0] += 0.25  # legs and all into the box

@@ -76,6 +76,23 @@ def moved(step: Step, *, support: str | None = None, position, firm=False) -> St
 # Standing.
 
 
+def test_who_rises_stands_as_at_first_and_else_stays_bent(ik, steps):
+    """The hand lets go of the box."""
+    made = find(ik, steps[:1])
+    key = made.keyframes[-1]
+    move = Move(limb=steps[0].move.limb, breaks=("LHand",), makes=None)
+    step = replace(steps[0], move=move)
+    away = []
+    for rises in (False, True):
+        again = plan_step(ik, key, replace(step, rises=rises), "direct", OPTIONS, quiet)
+        assert not isinstance(again, str)
+        assert surfaces(again[0]) == {"LFoot", "RFoot"}
+        joints = ik.world.qadr
+        away.append(np.abs(again[0].q - ik.world.home)[joints].max())
+    assert away[0] > 0.3
+    assert away[1] < 0.1
+
+
 def test_the_robot_starts_on_both_feet_at_rest_over_them(ik):
     key = standing(ik, OPTIONS)
     assert surfaces(key) == {"LFoot", "RFoot"}

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import nnls
 
 from clamber.posture.keyframe import bearing_frames
-from clamber.statics import com_margin, cone_generators, support_polygon
+from clamber.statics import com_margin, cone_generators, contact_forces, support_polygon
 from clamber.trajectory import (
     BASE_LENGTH,
     GRAVITY,
@@ -18,8 +18,10 @@ from clamber.trajectory import (
     HOLD_START,
     RATE,
     build_trajectory,
+    handed_over,
     holding_torque,
     phase_torques,
+    point_prices,
     zero_moment_point,
 )
 
@@ -251,6 +253,48 @@ def test_holding_torques_and_forces_in_the_cones_balance_gravity(
         base, joints = unbalanced(demo_kinematics, key.q, key.stance, tau)
         assert base < 1e-2  # [N, N m] of 300 N
         assert joints < 1e-2
+
+
+def test_feed_forward_balances_gravity_all_the_while_load_is_handed_over(
+    demo_plan, demo_kinematics
+):
+    """Contacts that leave bear until the centre of mass is over those that stay."""
+    for path in demo_plan.paths:
+        for phase in path.phases:
+            both = {
+                (c.surface, c.edge): c for c in (*phase.load_before, *phase.load_after)
+            }
+            for q, tau in zip(
+                phase.q, phase_torques(demo_kinematics, phase), strict=True
+            ):
+                base, joints = unbalanced(demo_kinematics, q, tuple(both.values()), tau)
+                assert base < 5e-2  # [N, N m] of 300 N
+                assert joints < 5e-2
+
+
+def test_a_contact_that_leaves_bears_less_and_less(demo_kinematics, knee_phases):
+    shift = knee_phases[0]
+    foot = next(c for c in shift.load_before if c.surface == "LFoot")
+    shares = []
+    for s in (0.0, 0.25, 0.5, 0.75, 0.95, 1.0):
+        contacts, price = handed_over(shift, s)
+        assert np.all(price >= 1.0)
+        if foot not in contacts:
+            shares.append(0.0)
+            continue
+        kin = demo_kinematics
+        kin.update(shift.q[0])  # the same posture: only the price differs
+        names, points, normals, mu = bearing_frames(kin, contacts)
+        prices = point_prices(kin, contacts, price)
+        assert len(prices) == len(points)
+        f = contact_forces(
+            points, normals, mu, kin.com.copy(), kin.world.mass, price=prices
+        ).forces
+        mine = [n == "LFoot" for n in names]
+        shares.append(float(f[mine, 2].sum()))
+    assert np.all(np.diff(shares[:-1]) <= 1e-6)
+    assert shares[0] > shares[-2] + 1.0
+    assert shares[-1] == 0.0
 
 
 def test_wrong_torques_balance_nothing(demo_plan, demo_kinematics):

@@ -28,7 +28,7 @@ import numpy as np
 from clamber.contact import Contact, ContactSequence, Region, Stance, region_of
 from clamber.errors import InputError
 from clamber.model import Kinematics, World
-from clamber.moves import Move, Step, split_moves
+from clamber.moves import Move, Step, on_feet, split_moves
 from clamber.path import Path
 from clamber.pipeline import PlanOptions, Progress
 from clamber.policy import GeneralPolicy
@@ -36,7 +36,6 @@ from clamber.posture.ik import IK
 from clamber.posture.keyframe import (
     STANDING_SHARE,
     Keyframe,
-    on_feet,
     standing_share,
 )
 from clamber.scaling import near_edge
@@ -466,7 +465,13 @@ class _Guidance:
             return len(after ^ {(c.surface, c.support) for c in there})
 
         i = min(range(len(self._sequence.stances)), key=unlike)
-        return Step(stance=i, target=self._sequence.stances[i], move=move)
+        contacts = _after(key.stance, move)
+        return Step(
+            stance=i,
+            target=self._sequence.stances[i],
+            move=move,
+            rises=on_feet(self._world, contacts) and self.left(contacts) == 0,
+        )
 
     def _longest(self, surface: str) -> float:
         """From shoulder or hip to a surface, the limb stretched [m]."""

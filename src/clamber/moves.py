@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +58,9 @@ class Step:
         guide: Where its postures may be found.
         base_rotation: (3, 3) R_WB of the pelvis that is preferred, or None.
         reference: (nq,) the posture to stay close to; None: the one before.
+        rises: To the posture that the robot starts in, which goes before these: it is
+            the last step, and ends on the feet. A person who has just got up is bent,
+            and so is a robot that held on till then.
     """
 
     stance: int
@@ -65,6 +69,7 @@ class Step:
     guide: Guide = Guide()
     base_rotation: np.ndarray | None = None
     reference: np.ndarray | None = None
+    rises: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -134,7 +139,19 @@ def split_moves(
         if len(steps) == before:
             reason = "; ".join(reasons) or "no limb makes or leaves a bearing contact"
             skipped.append(Skipped(stance=i, reason=reason))
+    if steps:
+        last = [c for c in closed.values() if c is not None]
+        steps[-1] = replace(steps[-1], rises=on_feet(world, last))
     return steps, skipped
+
+
+def on_feet(world: World, stance: Sequence[Contact]) -> bool:
+    """Whether a stance is one of feet alone: what ends so is meant to stand."""
+    limb_of = world.robot.limb_of
+    limbs = [(limb_of(c.surface), c.surface) for c in stance]
+    return bool(limbs) and all(
+        not limb.is_arm and surface == limb.surfaces[0] for limb, surface in limbs
+    )
 
 
 def same_place(a: Contact, b: Contact) -> bool:

@@ -19,7 +19,7 @@ from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import Kinematics, World
 from clamber.posture.ik import IK, ContactGoal, PostureProblem, support_rotation
-from clamber.posture.keyframe import contact_drift
+from clamber.posture.keyframe import contact_drift, holds
 from clamber.scene import Support
 from clamber.transition import CLEARANCE, Transition, balance_problem
 
@@ -358,7 +358,11 @@ def _drift(ik: IK, contacts: tuple[Contact, ...]) -> float:
 def check_phases(
     ik: IK, phases: tuple[Phase, ...], t: Transition
 ) -> tuple[Status, str]:
-    """Overlaps and contacts at all postures and half-way between, solver aside."""
+    """Overlaps and contacts at all postures and half-way between, solver aside.
+
+    Whether the contacts hold the robot at the postures of a swing, too: those at its
+    ends the transition has looked at, and while weight shifts more contacts bear.
+    """
     kin, world = ik.kin, ik.world
     worst, note = 0.0, ""
     moving = (*t.leaving, t.move.makes) if t.move.makes else t.leaving
@@ -376,4 +380,6 @@ def check_phases(
                 if drift > DRIFT_LIMIT:
                     where = f"{1e3 * drift:.0f} mm ({phase.kind})"
                     return Status.UNREACHABLE, f"a contact opens by {where}"
+            if phase.kind == "swing" and not holds(kin, phase.contacts):
+                return Status.OVERLOADED, ""
     return (Status.COLLIDING if worst > OVERLAP_LIMIT else Status.SOLVED), note

@@ -21,14 +21,13 @@ import numpy as np
 
 from clamber.contact import Contact
 from clamber.model import Kinematics
-from clamber.posture.keyframe import bearing_frames
+from clamber.posture.keyframe import EFFORT_SHARE, bearing_frames
 from clamber.statics import cone_generators, support_polygon
 
 JOINT_SPEED = 4.0  # [rad/s] of a joint whose description has no lower limit
 # [rad/s^2] of a joint: what servos of 600 N m/rad and 50 N m follow within 0.02 rad on
 # links of half a kg m^2.
 JOINT_ACCELERATION = 25.0
-EFFORT_SHARE = 0.9  # of the effort limits: the rest is the servos'
 INERTIA_SHARE = 0.6  # of what is left between rest and the border of what can be borne
 SLOW = 0.3  # [rad/s] where the limits leave nothing: as slow as this, as smooth
 TOUCH_SPEED = 0.08  # [m/s] along the normal, near a contact to be made

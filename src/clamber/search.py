@@ -216,6 +216,15 @@ def standing(
     )
 
 
+def _home_over(world: World, feet: Sequence[Contact]) -> np.ndarray:
+    """(nq,) the posture that the robot starts from, over feet somewhere."""
+    x, y, z = np.mean([c.position for c in feet], axis=0)
+    headings = np.sum([matrix_from_quat(c.quaternion)[:, 0] for c in feet], axis=0)
+    q = home_at(world, np.array([x, y, np.arctan2(headings[1], headings[0])]))
+    q[2] += z
+    return q
+
+
 def home_at(world: World, at: np.ndarray) -> np.ndarray:
     """(nq,) the posture that the robot starts from, moved along the ground.
 
@@ -293,21 +302,26 @@ def _plan_on(
     lap: Callable[[str], None],
 ) -> tuple[Keyframe, Path] | str:
     """The next keyframe and the path to it on the contacts `held`, or why not."""
-    move = step.move
+    move, world = step.move, ik.world
+    new = (move.makes,) if move.makes else ()
     task = KeyframeTask(
         held=held,
-        new=(move.makes,) if move.makes else (),
+        new=new,
         q_reference=before.q if step.reference is None else step.reference,
         directions=step.target.posture,
         base_rotation=step.base_rotation,
     )
+    begin = before.q
+    if step.rises:
+        task = replace(task, q_reference=world.home, directions={})
+        begin = _home_over(world, (*held, *new))
     wanted, result = move.makes, "nothing tried"
     for there in (True, False) if move.firm else (False, True):
         if wanted is not None and there:
             # Put the contact where the unloaded robot reaches it.
             key = _keyframe_there(ik, task, wanted, step, before.q, method, options)
         else:
-            key = METHODS[method](ik, task, before.q, options)
+            key = METHODS[method](ik, task, begin, options)
             if move.makes is not None:
                 wanted = next(c for c in key.stance if c.surface == move.makes.surface)
         lap("keyframes")

@@ -17,8 +17,9 @@ from clamber.disturbance import Disturbance
 from clamber.errors import InputError
 from clamber.execution import Event, Execution, Tracking
 from clamber.model import PHYSICS_STEP, World
+from clamber.moves import on_feet
 from clamber.pipeline import Plan
-from clamber.posture.keyframe import STANDING_SHARE, on_feet, standing_share
+from clamber.posture.keyframe import STANDING_SHARE, standing_share
 from clamber.scene import GROUND, Scene
 from clamber.sensing import Sensors
 from clamber.trajectory import Trajectory

@@ -23,7 +23,7 @@ from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from clamber.contact import Contact
 from clamber.model import Kinematics, World
 from clamber.path import Phase
-from clamber.posture.keyframe import bearing_frames, torque_limits
+from clamber.posture.keyframe import bearing_frames, holding_limits, torque_limits
 from clamber.retiming import GRID, demand_at, least_torques, retime
 from clamber.se3 import quat_conjugate, quat_multiply
 from clamber.statics import com_margins, contact_forces, support_polygon
@@ -41,7 +41,6 @@ BALANCE_SAMPLES = 24  # of the centre of mass along a phase
 BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
 SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
 GRAVITY = 9.81  # [m/s^2]
-EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
 LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
 TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
@@ -130,7 +129,7 @@ def holding_torque(
 ) -> np.ndarray:
     """(na,) joint torques that balance gravity with the least contact forces.
 
-    Where these ask more of a joint than `EFFORT_SHARE` of its limit, those that do not:
+    Where these ask more of a joint than its `holding_limits`, those that do not:
     a weak wrist leaves the load to the feet.
 
     Args:
@@ -144,7 +143,7 @@ def holding_torque(
     gravity = kin.gravity()
     names, points, normals, mu = bearing_frames(kin, contacts)
     com = kin.com.copy()
-    limits = EFFORT_SHARE * w.tau_max
+    limits = holding_limits(w)
     tau, torque = np.zeros(len(w.dadr)), None
     prices = None if price is None else point_prices(kin, contacts, price)
     for _ in range(2):
@@ -157,7 +156,7 @@ def holding_torque(
         tau = total[w.dadr]
         if np.all(np.abs(tau) <= limits):
             break
-        torque = torque_limits(kin, names, points, EFFORT_SHARE)
+        torque = torque_limits(kin, names, points)
     return np.clip(tau, -w.tau_max, w.tau_max)
 
 

@@ -33,6 +33,7 @@ from clamber.posture.ik import (
 from clamber.se3 import quat_from_matrix
 from clamber.statics import (
     BALANCE_TOL,
+    GRAVITY,
     Phase,
     StaticEquilibrium,
     TorqueLimits,
@@ -45,6 +46,9 @@ from clamber.statics import (
 )
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
+EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
+SPARED_ARM = 0.004  # [m] times the weight: torque that is not counted on for holding
+LEAST_SHARE = 0.25  # of the effort limits that is, all the same
 CLEARANCE = 0.010  # [m] p_safe: between links, and between links and the scene
 STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
 HOLD_WEIGHT = 40.0  # of a new contact at a position that an outer method prescribes
@@ -253,7 +257,7 @@ def bearing_frames(
 
 
 def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEquilibrium:
-    """Static equilibrium with cones and torque limits at the present posture."""
+    """Static equilibrium with cones and `holding_limits` at the present posture."""
     names, points, normals, mu = bearing_frames(kin, contacts)
     return static_equilibrium(
         points,
@@ -278,16 +282,27 @@ def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
     return found.residual <= BALANCE_TOL
 
 
+def holding_limits(world: World) -> np.ndarray:
+    """(na,) torques that are counted on to hold a posture [N m].
+
+    `EFFORT_SHARE` of the effort limits, less what a contact costs that lies beside
+    where it was planned: `SPARED_ARM` times the weight is 16 mm for one that bears a
+    quarter. To a strong joint that is nothing, to a weak wrist much.
+    """
+    spared = SPARED_ARM * world.mass * GRAVITY
+    least = LEAST_SHARE * world.tau_max
+    return np.maximum(EFFORT_SHARE * world.tau_max - spared, least)
+
+
 def torque_limits(
-    kin: Kinematics, names: Sequence[str], points: np.ndarray, share: float = 1.0
+    kin: Kinematics, names: Sequence[str], points: np.ndarray
 ) -> TorqueLimits:
-    """What the joints can bear with forces at bearing points, a share of their limits.
+    """What the joints bear, `holding_limits`, with forces at bearing points.
 
     Args:
         kin: At the posture.
         names: Surface of each point.
         points: (n, 3) in the world.
-        share: Of the effort limits.
     """
     w = kin.world
     J = np.concatenate(
@@ -300,7 +315,7 @@ def torque_limits(
         jacobian=J,
         gravity=kin.gravity(),
         dofs=w.dadr,
-        limits=share * w.tau_max,
+        limits=holding_limits(w),
         names=w.joints,
     )
 
@@ -364,15 +379,6 @@ def finish(
         iterations=iterations,
         cost_before=cost_before,
         cost_after=cost_after,
-    )
-
-
-def on_feet(world: World, stance: Sequence[Contact]) -> bool:
-    """Whether a stance is one of feet alone: what ends so is meant to stand."""
-    limb_of = world.robot.limb_of
-    limbs = [(limb_of(c.surface), c.surface) for c in stance]
-    return bool(limbs) and all(
-        not limb.is_arm and surface == limb.surfaces[0] for limb, surface in limbs
     )
 
 
