@@ -9,6 +9,7 @@ from clamber.errors import InputError
 from clamber.route import (
     BESIDE,
     BORDER,
+    GAP,
     find_place,
     find_platforms,
     goal_of,
@@ -109,9 +110,37 @@ def test_a_goal_off_the_ground_is_refused_and_a_missing_one_is_the_first_top():
 
 
 def test_a_gap_of_exactly_what_is_crawled_across_is_crawled_across():
-    """0.30 m, which no sum of lengths is to the last bit."""
-    boxes = scene(box("a", 0.6), box("b", 1.5), goal=(4.0, 0.0))
+    """0.40 m, which no sum of lengths is to the last bit."""
+    boxes = scene(box("a", 0.6), box("b", 1.6), goal=(4.0, 0.0))
     assert len(find_platforms(boxes, np.array([4.0, 0.0]))) == 1
+    wider = scene(box("a", 0.6), box("b", 1.61), goal=(4.0, 0.0))
+    assert len(find_platforms(wider, np.array([4.0, 0.0]))) == 2
+
+
+def test_over_the_widest_gap_that_is_crossed_there_is_a_place_on_either_side():
+    """What is wanted over its middle is no farther from a border than is looked."""
+    s = scene(box("a", 0.6), box("b", 1.2 + GAP))
+    middle = 0.9 + GAP / 2
+    for x, side in ((middle - 0.005, "a"), (middle + 0.005, "b")):
+        place = find_place(s, ("a", "b"), np.array([x, 0.1]), 0.06)
+        assert place is not None
+        assert place.support == side
+
+
+def test_a_platform_knows_the_gaps_on_its_way_in_order():
+    boxes = (
+        box("c", 2.5, y=-0.05),
+        box("a", 0.6),
+        box("b", 1.55, y=0.1),
+        box("d", 3.11, y=0.0),  # so near to the one before that there is no gap
+    )
+    goal = np.array([5.0, 0.0])
+    (platform,) = find_platforms(scene(*boxes, goal=goal), goal)
+    assert platform.boxes == ("a", "b", "c", "d")
+    first, second = platform.gaps
+    np.testing.assert_allclose(first, [[0.9, 0.0], [1.25, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(second, [[1.85, 0.0], [2.2, 0.0]], atol=1e-12)
+    assert find_platforms(scene(box("a", 0.6)), goal)[0].gaps == ()
 
 
 def test_the_room_on_a_box_is_that_to_the_nearest_other_box():

@@ -285,6 +285,140 @@ def test_a_box_too_high_a_goal_on_it_and_a_policy_without_a_way_are_refused(robo
         plan_traverse(flat, robot, scene())
 
 
+def row(gap: float, *lengths: float) -> Scene:
+    """Boxes one behind the other, the first 0.23 m ahead."""
+    boxes, x = [], 0.23
+    for i, length in enumerate(lengths):
+        boxes.append(
+            Box(
+                name=f"b{i + 1}",
+                size=np.array([length, 0.8, 0.25]),
+                position=np.array([x + length / 2, 0.0, 0.125]),
+                rotation=np.eye(3),
+            )
+        )
+        x += length + gap
+    goal = np.array([x - gap + 0.5, 0.0])
+    return Scene(boxes=tuple(boxes), start=np.zeros(3), goal=goal)
+
+
+@pytest.fixture(scope="module")
+def gap_task(robot):
+    """From x = 0.83 to 1.13: contacts are made up to 0.81 and from 1.15 on."""
+    ik = IK(build_world(robot, row(0.3, 0.6, 0.7)))
+    return module._task(ik, POLICY, PlanOptions())
+
+
+def due(task, arms: float, legs: float, *, outer=False):
+    """What is due where elbows (or hands) and knees are at these x."""
+    names = {"left_arm": "LElbow", "right_arm": "RElbow"}
+    names |= {"left_leg": "LKnee", "right_leg": "RKnee"}
+    on = {}
+    for n, surface in names.items():
+        x = arms if n.endswith("arm") else legs
+        support = "b1" if x < 1.0 else "b2"
+        on[n] = contact(surface, x, task.build.fours[n][1], support)
+    frame = module._fours_frame(task, tuple(on.values()))
+    wanted = module._Frame(np.array([1.6, 0.0]), 0.0)
+    (platform,) = task.platforms
+    found = module._due_near_gap(task, platform, on, names, frame, wanted)
+    return tuple({n: float(p.position[0]) for n, p in x.items()} for x in found)
+
+
+ARMS, LEGS = {"left_arm", "right_arm"}, {"left_leg", "right_leg"}
+
+
+def test_far_from_a_gap_and_beyond_it_nothing_is_due_there(gap_task):
+    assert due(gap_task, 0.55, 0.35) == ({}, {})
+    assert due(gap_task, 1.40, 1.17) == ({}, {})
+
+
+def test_arms_wait_at_a_gap_until_the_legs_are_near_enough(gap_task):
+    stretched = 2.0 * gap_task.build.stretch
+    walks, hops = due(gap_task, 0.80, 0.40)
+    assert set(walks) == LEGS  # elbows are at the border already
+    assert not hops
+    assert max(walks.values()) <= 0.40 + gap_task.build.step["left_leg"] + module.SAME
+    walks, hops = due(gap_task, 0.80, 0.98 - stretched + 0.01)
+    assert set(hops) == ARMS
+    for x in hops.values():
+        assert 1.15 <= x <= 1.17
+    # Knees any nearer to the elbows could not let go of them.
+    for x in walks.values():
+        assert x <= 0.98 - stretched + 2.0 * module.SAME
+
+
+def test_legs_step_across_together_once_the_arms_are_far_enough(gap_task):
+    stretched = 2.0 * gap_task.build.stretch
+    walks, hops = due(gap_task, 1.20, 0.80)
+    assert set(walks) == ARMS
+    assert not hops
+    walks, hops = due(gap_task, 0.98 + stretched, 0.80)
+    assert set(hops) == LEGS
+    assert all(1.15 <= x <= 1.17 for x in hops.values())
+
+
+def test_a_gap_is_ahead_until_the_last_contact_is_over_it(gap_task):
+    (platform,) = gap_task.platforms
+    to = np.array([1.6, 0.0])
+
+    def ahead(*x: float):
+        stance = [contact(s, v, 0.0) for s, v in zip(FOURS, x, strict=True)]
+        return module._gaps_ahead(platform, stance, to)
+
+    ((near, far),) = ahead(0.7, 0.7, 0.5, 0.45)
+    assert (near, far) == pytest.approx((0.38, 0.68))
+    assert len(ahead(1.4, 1.4, 1.2, 0.8)) == 1
+    assert ahead(1.4, 1.4, 1.2, 1.15) == []
+
+
+def test_contacts_that_come_back_to_where_they_were_end_the_plan(task, monkeypatch):
+    """To and fro, without getting nearer: it would go on so for ever."""
+    places = {"ahead": 0.7, "back": 0.6}
+    keys = {
+        n: SimpleNamespace(stance=(contact("LKnee", x, 0.1), contact("RKnee", x, -0.1)))
+        for n, x in places.items()
+    }
+
+    def manoeuvre(task, key):
+        other = keys["back" if key is keys["ahead"] else "ahead"]
+        return [(other, "path", "ac3")], ""
+
+    monkeypatch.setattr(module, "_manoeuvre", manoeuvre)
+    found = module._follow(task, keys["back"], 100, lambda *a: None)
+    assert not found.arrived
+    assert "to and fro" in found.missed
+    assert len(found.paths) == 3  # ahead, back, and ahead again
+    same = module._same
+    a, b = keys["back"].stance, keys["ahead"].stance
+    assert same(a, a[::-1])
+    assert not same(a, b)
+    assert not same(a, a[:1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.1, 0.3])
+def test_a_gap_between_boxes_is_crossed_on_top(robot, gap):
+    scene = row(gap, 0.6, 0.6)
+    plan = plan_traverse(POLICY, robot, scene)
+    assert plan.complete, plan.skipped
+    assert all(c.support == GROUND for c in plan.keyframes[-1].stance)
+    assert plan.keyframes[-1].q[0] > 1.43 + gap
+    tops = {b.name: b.top for b in scene.boxes}
+    supports = [{c.support for c in k.stance} for k in plan.keyframes]
+    up, down = supports.index({"b1"}), supports.index({"b2"})
+    assert up < down
+    assert not any(GROUND in s for s in supports[up:down])
+    for c in (c for k in plan.keyframes[up:down] for c in k.stance):
+        assert tops[c.support].inside(c.position, 0.01)
+    kin = Kinematics(plan.world)
+    for path in plan.paths:
+        for phase in path.phases:
+            for q in phase.q:
+                kin.update(q)
+                assert max(contact_drift(kin, c) for c in phase.contacts) < 0.005
+
+
 @pytest.mark.slow
 def test_on_bare_ground_it_steps_to_the_goal_and_stands(robot):
     bare = Scene(start=np.zeros(3), goal=np.array([0.3, 0.1, 0.5]))

@@ -17,7 +17,7 @@ from clamber.errors import InputError
 from clamber.policy import Edge
 from clamber.scene import GROUND_HALF_SIZE, Scene, Support
 
-GAP = 0.45  # [m] a narrower gap is crossed on top, a wider one on the ground
+GAP = 0.40  # [m] a narrower gap is crossed on top, a wider one on the ground
 JOINT = 0.02  # [m] a narrower gap is none
 BESIDE = (
     0.25  # [m] a gate keeps so far from the ends of its edge, where it is that long

@@ -247,13 +247,18 @@ def _follow(
     task = tasks[0]
     first = cost_to_go(key.stance, task.goal)
     missed, arrived = "", False
-    best, idle = math.inf, 0
+    best = math.inf
+    since: list[tuple[Contact, ...]] = []  # stances since it last got nearer
     while len(paths) < changes:
         to_go = cost_to_go(keyframes[-1].stance, task.goal)
-        idle = idle + 1 if to_go > best - NEARER_BY else 0
-        best = min(best, to_go) if idle else to_go
-        if idle > PATIENCE:
+        nearer = to_go <= best - NEARER_BY
+        best = to_go if nearer else min(best, to_go)
+        since = [*(() if nearer else since), keyframes[-1].stance]
+        if len(since) > PATIENCE + 1:
             missed = f"{PATIENCE} cycles bring it no nearer to the goal, {to_go:.2f} m"
+            break
+        if any(_same(since[-1], stance) for stance in since[:-1]):
+            missed = f"it only goes to and fro, {to_go:.2f} m from the goal"
             break
         share = 1.0 - min(to_go / max(first, 1e-9), 1.0)
         report("plan", share, f"{to_go:.2f} m to go, {len(paths)} contact changes")
@@ -289,6 +294,14 @@ def _follow(
         missed=missed,
         arrived=arrived,
         instead="; ".join(instead),
+    )
+
+
+def _same(a: Sequence[Contact], b: Sequence[Contact]) -> bool:
+    """The same surfaces are where they were: what came next will come again."""
+    there = {c.surface: c.position for c in b}
+    return {c.surface for c in a} == set(there) and all(
+        np.linalg.norm(c.position - there[c.surface]) < NEARER_BY for c in a
     )
 
 
@@ -928,9 +941,7 @@ def _gaps_ahead(
     last = points[np.argmin(points @ way)]
     spans = [tuple(map(float, (gap - last) @ way)) for gap in platform.gaps]
     return [
-        (near, far)
-        for near, far in spans
-        if far > 0.0 and near < (wanted - last) @ way
+        (near, far) for near, far in spans if far > 0.0 and near < (wanted - last) @ way
     ]
 
 
@@ -949,30 +960,31 @@ def _over_gap(
     """
     if abs(_apart(frame.yaw, wanted.yaw)) > FACING:
         return []
+    limbs = task.ik.world.robot.limbs
     surfaces = {task.ik.world.robot.limb_of(s).name: s for s in option.surfaces}
     on = _by_limb(task, key.stance)
     walks, hops = _due_near_gap(task, platform, on, surfaces, frame, wanted)
-    limbs = task.ik.world.robot.limbs
-    made: list[_Made] = []
+    walked: list[_Made] = []
     for n, place in walks.items():
-        own = (on[n].surface, *limbs[n].surfaces) if limbs[n].is_arm else (surfaces[n],)
-        _make(task, key, option, wanted, own, place, made)
-    before = len(made)
-    for surface, place in ((surfaces[n], p) for n, p in hops.items()):
-        _make(task, key, option, wanted, (surface,), place, made)
-    if len(made) == before + len(hops):
-        return made
-    del made[before:]
-    for n in hops:
-        if not limbs[n].is_arm and on[n].surface == surfaces[n]:
-            here = Place(support=on[n].support, position=on[n].position)
-            _make(task, key, option, wanted, limbs[n].surfaces[:1], here, made)
-    standing = len(made)
-    for n, place in hops.items():
-        order = 1 if limbs[n].is_arm else -1
-        own = limbs[n].surfaces[::order]
-        _make(task, key, option, wanted, own, place, made)
-    return made[: before if len(made) == standing else None]
+        own = (surfaces[n],)
+        if limbs[n].is_arm:
+            own = sorted(limbs[n].surfaces, key=lambda s: s != on[n].surface)
+        _make(task, key, option, wanted, own, place, walked)
+    for outer in (False, True):
+        made = list(walked)
+        for n in hops if outer else ():
+            if not limbs[n].is_arm and on[n].surface == surfaces[n]:
+                here = Place(support=on[n].support, position=on[n].position)
+                _make(task, key, option, wanted, limbs[n].surfaces[:1], here, made)
+        before = len(made)
+        for n, place in hops.items():
+            own = (surfaces[n],)
+            if outer:
+                own = limbs[n].surfaces[:: 1 if limbs[n].is_arm else -1]
+            _make(task, key, option, wanted, own, place, made)
+        if len(made) == before + len(hops):
+            return made
+    return made if len(made) > before else walked
 
 
 def _due_near_gap(
@@ -1011,7 +1023,8 @@ def _due_near_gap(
     x = min(at[n] - offsets[n][0] for n in surfaces)
     walks: dict[str, float] = {}
     hops: dict[str, float] = {}
-    while x < length and x <= min((*walks.values(), *hops.values()), default=x) + step:
+    last = math.inf
+    while x < min(length, last):
         x += SAME
         for n in surfaces:
             to = place(n, x)
@@ -1020,13 +1033,13 @@ def _due_near_gap(
                 hops.setdefault(n, x)
             elif ahead > SAME and n not in hops:
                 walks.setdefault(n, x)
-    first = min(hops, key=lambda n: hops[n], default=None)
-    if first is not None:
-        arm = task.ik.world.robot.limbs[first].is_arm
-        x = hops[first]
-        hops = {
-            n: d for n, d in hops.items() if task.ik.world.robot.limbs[n].is_arm == arm
-        }
+            if ahead > SAME:  # where the first is due, it is that far ahead already
+                last = min(last, x + step - 2.0 * SAME)
+    if hops:  # those of the first that is due, both arms or both legs
+        x, first = min((d, n) for n, d in hops.items())
+        limbs = task.ik.world.robot.limbs
+        arms = limbs[first].is_arm
+        hops = {n: d for n, d in hops.items() if limbs[n].is_arm == arms}
     walks = {n: d for n, d in walks.items() if d <= x and n not in hops}
     return (
         {n: place(n, x) for n in sorted(walks, key=lambda n: walks[n])},
