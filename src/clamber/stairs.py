@@ -34,7 +34,7 @@ class Gait:
     Attributes:
         lead: Hands are set down so far ahead of the feet [m].
         gap: Feet come no nearer to the hands than this [m].
-        knee: Knees come so far behind the last edge [m].
+        knee: Knees come so far behind the last edge, at least [m].
         span: From knees to hands at the end [m].
         sides: Of each surface, to the left of the way [m].
     """
@@ -82,7 +82,11 @@ def is_flight(world: World, platform: Platform) -> bool:
 
 
 def next_contacts(
-    world: World, platform: Platform, stance: Sequence[Contact], gait: Gait
+    world: World,
+    platform: Platform,
+    stance: Sequence[Contact],
+    goal: np.ndarray,
+    gait: Gait,
 ) -> list[tuple[str, tuple[Place, ...]]]:
     """The next surfaces to be set down, each with its places, the best one first.
 
@@ -94,10 +98,12 @@ def next_contacts(
         world: Robot and scene.
         platform: The flight.
         stance: On the ground and the treads, or on some of them.
+        goal: (2,) where the body shall get to [m].
         gait: Of the robot.
     """
     edge = platform.entry
     left = np.array([-edge.inward[1], edge.inward[0]])
+    goal_x = edge.distance(goal)
     at = {world.robot.limb_of(c.surface).name: c for c in stance}
     x = {limb: _along(world, edge, c) for limb, c in at.items()}
     arms = [b for b in world.robot.limbs.values() if b.is_arm]
@@ -122,7 +128,7 @@ def next_contacts(
     for arm in arms:
         hand = arm.surfaces[0]
         room = treads(hand)
-        end = room[-1].edge + gait.knee + gait.span
+        end = _end(room[-1], goal_x, gait) + gait.span
         spot = _nearest(room, min(behind + gait.lead, end))
         firm = arm.name in at and at[arm.name].surface == hand
         if not firm or (on == legs and spot.x - x[arm.name] >= WORTH):
@@ -145,7 +151,13 @@ def next_contacts(
     if feet:
         return feet
     knees = [(b.surfaces[-1], treads(b.surfaces[-1])[-1]) for b in on]
-    return [places(k, [t.near(t.edge + gait.knee)]) for k, t in knees]
+    return [places(k, [t.near(_end(t, goal_x, gait))]) for k, t in knees]
+
+
+def _end(last: _Tread, goal: float, gait: Gait) -> float:
+    """Where the knees come on the last tread: around the goal, if it is near enough."""
+    first = last.edge + gait.knee
+    return float(np.clip(goal - gait.span / 2, first, first + gait.gap))
 
 
 def _along(world: World, edge: Edge, c: Contact) -> float:

@@ -414,7 +414,9 @@ def _up_stairs(
 
     Where not all of a pair get to their places, all go to their next best.
     """
-    wanted = next_contacts(task.ik.world, platform, key.stance, task.build.gait)
+    wanted = next_contacts(
+        task.ik.world, platform, key.stance, task.goal, task.build.gait
+    )
     some: list[_Made] = []
     why = ""
     for rank in range(max((len(places) for _, places in wanted), default=0)):
