@@ -1,10 +1,10 @@
 """A flight of stairs -> where hands, feet and knees go next, tread after tread.
 
-A robot that kneels on a narrow tread cannot get up the next riser: with one knee up, the
-thigh of the other meets the riser's upper edge before the weight is past the first. A
-foot that stays behind lets the body get past. So stairs are climbed on hands and feet,
-the hands as far ahead as on a box that is climbed from the ground, and the last riser is
-climbed like that box, on knees.
+A robot that kneels on a narrow tread cannot get up the next riser: with one knee up,
+the thigh of the other meets the riser's upper edge before the weight is past the first.
+A foot that stays behind lets the body get past. So stairs are climbed on hands and
+feet, the hands as far ahead as on a box that is climbed from the ground, and the last
+riser is climbed like that box, on knees.
 
 Lengths along the flight count from the edge where it begins, inwards.
 """
@@ -75,10 +75,26 @@ class _Tread:
         return [_Spot(self.name, p) for p in dict.fromkeys((far, self.low))]
 
 
-def is_flight(world: World, platform: Platform) -> bool:
-    """Whether each box of a platform is higher than the one before it."""
-    tops = [world.supports[n].position[2] for n in platform.boxes]
-    return len(tops) > 1 and bool(np.all(np.diff(tops) > FLUSH))
+def is_flight(world: World, platform: Platform, gait: Gait) -> bool:
+    """Whether each box is higher than the one before, with room for what steps there.
+
+    Hands and feet on every tread, but no feet on the last, where the knees come.
+    """
+    boxes = platform.boxes
+    tops = [world.supports[n].position[2] for n in boxes]
+    if len(tops) < 2 or not np.all(np.diff(tops) > FLUSH):
+        return False
+
+    def fits(surface: str, on: Sequence[str]) -> bool:
+        found = {t.name for t in _treads(world, platform, surface, gait)}
+        return found.issuperset(on)
+
+    return all(
+        fits(limb.surfaces[0], boxes)
+        if limb.is_arm
+        else fits(limb.surfaces[0], boxes[:-1]) and fits(limb.surfaces[-1], boxes[-1:])
+        for limb in world.robot.limbs.values()
+    )
 
 
 def next_contacts(
@@ -121,7 +137,7 @@ def next_contacts(
         return surface, tuple(out)
 
     def treads(surface: str) -> list[_Tread]:
-        return _treads(world, platform, surface, gait.sides[surface])
+        return _treads(world, platform, surface, gait)
 
     behind = min(x[b.name] for b in on)
     hands = []
@@ -143,8 +159,8 @@ def next_contacts(
     feet = []
     before = min(x[b.name] for b in arms) - gait.gap
     for leg in on if on == legs else ():
-        room = treads(leg.surfaces[0])
-        spots = [s for t in room[-2::-1] for s in t.up_to(before)]
+        below = [t for t in treads(leg.surfaces[0]) if t.name != platform.boxes[-1]]
+        spots = [s for t in below[::-1] for s in t.up_to(before)]
         spots = [s for s in spots if s.x - x[leg.name] >= WORTH]
         if spots:
             feet.append(places(leg.surfaces[0], spots))
@@ -174,14 +190,12 @@ def _half(surface: Surface) -> float:
     return 0.5 * float(np.ptp(surface.corners @ surface.rotation[:, 0]))
 
 
-def _treads(
-    world: World, platform: Platform, surface: str, side: float
-) -> list[_Tread]:
-    """The treads on which a surface finds room, `side` to the left of the way [m]."""
+def _treads(world: World, platform: Platform, surface: str, gait: Gait) -> list[_Tread]:
+    """The treads on which a surface finds room, on its side of the way."""
     s, edge = world.surfaces[surface], platform.entry
     half = _half(s)
-    start = edge.point + side * np.array([-edge.inward[1], edge.inward[0]])
-    start = start - edge.inward
+    left = np.array([-edge.inward[1], edge.inward[0]])
+    start = edge.point + gait.sides[surface] * left - edge.inward
     met = []
     for name in platform.boxes:
         over = crossing(world.supports[name], start, start + FAR * edge.inward)
