@@ -201,9 +201,9 @@ def _treads(world: World, platform: Platform, surface: str, gait: Gait) -> list[
         over = crossing(world.supports[name], start, start + FAR * edge.inward)
         if over is not None:
             met.append((name, FAR * over[0] - 1.0, FAR * over[1] - 1.0))
-    risers = [m[1] for m in met[1:]] + [np.inf]
+    risers = [m[1] for m in (*met[1:], ("", np.inf))]
     out = []
-    for (name, begin, end), riser in zip(met, risers, strict=True):
+    for (name, begin, end), riser in zip(met, risers, strict=False):
         low = begin + half + BORDER
         high = min(end - half - BORDER, riser - max(s.radius, half) - CLEAR)
         if low <= high:
