@@ -80,11 +80,11 @@ def narrow() -> Flight:
 
 
 def test_a_flight_goes_up_and_has_room_for_hands_and_feet(narrow):
-    assert is_flight(narrow.world, narrow.platform, GAIT)
+    assert is_flight(narrow.world, narrow.platform, narrow.goal, GAIT)
 
     def flight(scene: Scene) -> bool:
         f = Flight(scene)
-        return is_flight(f.world, f.platform, GAIT)
+        return is_flight(f.world, f.platform, f.goal, GAIT)
 
     assert not flight(stairs(1, 0.15, 0.4))
     assert not flight(stairs(3, 0.15, 0.22))  # a foot of 0.2 m and its borders
@@ -191,6 +191,16 @@ def test_a_limb_without_a_contact_is_set_down_first(narrow):
     assert set(narrow.next()) == {"RHand"}
 
 
+def test_who_starts_beside_the_goal_comes_nearer_to_it_with_every_tread():
+    aside = Flight(replace(stairs(3, 0.15, 0.25), start=np.array([0.0, 0.1, 0.0])))
+    entry = aside.platform.entry.point
+    assert entry[1] > 0.05
+    for surface, (place,) in aside.next().items():
+        share = aside.x(place.position) / aside.x(aside.goal)
+        side = GAIT.sides[surface]
+        assert place.position[1] - side == pytest.approx((1.0 - share) * entry[1])
+
+
 def test_an_elbow_gives_way_to_the_hand(narrow):
     narrow.put("RHand", "s2", 0.53)
     narrow.set("LElbow", Place(support="s2", position=np.array([0.53, 0.17, 0.3])))
@@ -227,7 +237,7 @@ def test_the_way_up_ends_with_all_on_the_last_tread(steps, tread, yaw):
     )
     goal = turn[:2, :2] @ flat.goal
     flight = Flight(Scene(boxes=boxes, start=np.array([0.0, 0, yaw]), goal=goal))
-    assert is_flight(flight.world, flight.platform, GAIT)
+    assert is_flight(flight.world, flight.platform, flight.goal, GAIT)
     for _ in range(20 * steps):
         wanted = flight.next()
         if not wanted:

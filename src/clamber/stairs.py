@@ -75,10 +75,11 @@ class _Tread:
         return [_Spot(self.name, p) for p in dict.fromkeys((far, self.low))]
 
 
-def is_flight(world: World, platform: Platform, gait: Gait) -> bool:
+def is_flight(world: World, platform: Platform, goal: np.ndarray, gait: Gait) -> bool:
     """Whether each box is higher than the one before, with room for what steps there.
 
-    Hands and feet on every tread, but no feet on the last, where the knees come.
+    Hands and feet on every tread, but no feet on the last, where the knees come, on the
+    way from its first edge to a goal (2,).
     """
     boxes = platform.boxes
     tops = [world.supports[n].position[2] for n in boxes]
@@ -86,7 +87,7 @@ def is_flight(world: World, platform: Platform, gait: Gait) -> bool:
         return False
 
     def fits(surface: str, on: Sequence[str]) -> bool:
-        found = {t.name for t in _treads(world, platform, surface, gait)}
+        found = {t.name for t in _treads(world, platform, surface, goal, gait)}
         return found.issuperset(on)
 
     return all(
@@ -118,7 +119,6 @@ def next_contacts(
         gait: Of the robot.
     """
     edge = platform.entry
-    left = np.array([-edge.inward[1], edge.inward[0]])
     goal_x = edge.distance(goal)
     at = {world.robot.limb_of(c.surface).name: c for c in stance}
     x = {limb: _along(world, edge, c) for limb, c in at.items()}
@@ -131,13 +131,14 @@ def next_contacts(
     def places(surface: str, spots: Sequence[_Spot]) -> tuple[str, tuple[Place, ...]]:
         out = []
         for s in spots:
-            p = edge.point + s.x * edge.inward + gait.sides[surface] * left
+            origin, way = _line(edge, goal, gait.sides[surface])
+            p = origin + s.x * way
             q = world.supports[s.support].project(np.array([*p, 0.0]))
             out.append(Place(support=s.support, position=q))
         return surface, tuple(out)
 
     def treads(surface: str) -> list[_Tread]:
-        return _treads(world, platform, surface, gait)
+        return _treads(world, platform, surface, goal, gait)
 
     behind = min(x[b.name] for b in on)
     hands = []
@@ -176,6 +177,17 @@ def _end(last: _Tread, goal: float, gait: Gait) -> float:
     return float(np.clip(goal - gait.span / 2, first, first + gait.gap))
 
 
+def _line(edge: Edge, goal: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+    """The line that a surface follows, `side` to the left of that to the goal.
+
+    Returns:
+        (2,) where it crosses the edge, and (2,) the way for each metre of the flight.
+    """
+    left = np.array([-edge.inward[1], edge.inward[0]])
+    way = (goal - edge.point) / edge.distance(goal)
+    return edge.point + side * left, way
+
+
 def _along(world: World, edge: Edge, c: Contact) -> float:
     """Of a contact's middle, from the edge inwards [m]."""
     x = edge.distance(c.position)
@@ -190,15 +202,17 @@ def _half(surface: Surface) -> float:
     return 0.5 * float(np.ptp(surface.corners @ surface.rotation[:, 0]))
 
 
-def _treads(world: World, platform: Platform, surface: str, gait: Gait) -> list[_Tread]:
+def _treads(
+    world: World, platform: Platform, surface: str, goal: np.ndarray, gait: Gait
+) -> list[_Tread]:
     """The treads on which a surface finds room, on its side of the way."""
-    s, edge = world.surfaces[surface], platform.entry
+    s = world.surfaces[surface]
     half = _half(s)
-    left = np.array([-edge.inward[1], edge.inward[0]])
-    start = edge.point + gait.sides[surface] * left - edge.inward
+    origin, way = _line(platform.entry, goal, gait.sides[surface])
+    start = origin - way
     met = []
     for name in platform.boxes:
-        over = crossing(world.supports[name], start, start + FAR * edge.inward)
+        over = crossing(world.supports[name], start, start + FAR * way)
         if over is not None:
             met.append((name, FAR * over[0] - 1.0, FAR * over[1] - 1.0))
     risers = [m[1] for m in (*met[1:], ("", np.inf))]

@@ -290,7 +290,7 @@ def _manoeuvre(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
         if platform.exit is not None and platform.exit.distance(feet) < 0:
             return _climb_down(task, key, platform)
         return _climb(task, key, platform)
-    if is_flight(task.ik.world, platform, task.build.gait):
+    if _is_flight(task, platform):
         made, why = _up_stairs(task, key, platform)
         if made or why:
             return made, why
@@ -402,9 +402,13 @@ def _ankles(task: _Task, body: _Frame) -> np.ndarray:
 
 def _climb(task: _Task, key: Keyframe, platform: Platform) -> tuple[list[_Made], str]:
     """The next contacts of a flight of stairs, or all that is left of a climb."""
-    if is_flight(task.ik.world, platform, task.build.gait):
+    if _is_flight(task, platform):
         return _up_stairs(task, key, platform)
     return _climb_up(task, key, platform.entry, platform)
+
+
+def _is_flight(task: _Task, platform: Platform) -> bool:
+    return is_flight(task.ik.world, platform, task.goal, task.build.gait)
 
 
 def _up_stairs(
