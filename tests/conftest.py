@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from clamber.scene import Box, Scene
+
 ROOT = Path(__file__).parents[1]
 
 # A cart on a rail with a swinging, weighted arm over a box: two joints, three geoms.
@@ -29,6 +31,21 @@ TOY = """
   </worldbody>
 </mujoco>
 """
+
+
+def stairs(steps: int, rise: float, tread: float) -> Scene:
+    """One behind the other; the goal is the middle of the last."""
+    boxes = tuple(
+        Box(
+            name=f"s{i + 1}",
+            size=np.array([tread, 0.8, rise * (i + 1)]),
+            position=np.array([0.23 + tread * (i + 0.5), 0.0, rise * (i + 1) / 2]),
+            rotation=np.eye(3),
+        )
+        for i in range(steps)
+    )
+    goal = np.array([0.23 + tread * (steps - 0.5), 0.0])
+    return Scene(boxes=boxes, start=np.zeros(3), goal=goal)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from clamber.posture.keyframe import KeyframeTask, contact_drift
 from clamber.scene import GROUND, Box, Scene
 from clamber.search import standing
 from clamber.traverse import cost_to_go, follow_policy, plan_traverse
+from conftest import stairs
 
 
 def option(name: str, region, surfaces, until) -> Option:
@@ -66,21 +67,6 @@ def scene(length=0.6, width=0.8, height=0.25, face=0.23, goal=None) -> Scene:
     )
     goal = [face + length + 0.25, 0.0] if goal is None else goal
     return Scene(boxes=(box,), start=np.zeros(3), goal=np.array(goal))
-
-
-def stairs(steps: int, rise: float, tread: float) -> Scene:
-    """One behind the other; the goal is the middle of the last."""
-    boxes = tuple(
-        Box(
-            name=f"s{i + 1}",
-            size=np.array([tread, 0.8, rise * (i + 1)]),
-            position=np.array([0.23 + tread * (i + 0.5), 0.0, rise * (i + 1) / 2]),
-            rotation=np.eye(3),
-        )
-        for i in range(steps)
-    )
-    goal = np.array([0.23 + tread * (steps - 0.5), 0.0])
-    return Scene(boxes=boxes, start=np.zeros(3), goal=goal)
 
 
 def contact(surface: str, x: float, y: float, support="table") -> Contact:
@@ -253,7 +239,8 @@ def test_boxes_of_one_height_are_no_stairs(robot, task):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("steps", "rise", "tread"), [(3, 0.1, 0.4), (2, 0.15, 0.4), (3, 0.1, 0.3)]
+    ("steps", "rise", "tread"),
+    [(3, 0.1, 0.4), (2, 0.15, 0.4), (3, 0.1, 0.3), (6, 0.15, 0.25), (2, 0.08, 0.25)],
 )
 def test_stairs_are_climbed_until_all_weight_is_on_the_last(robot, steps, rise, tread):
     plan = plan_traverse(POLICY, robot, stairs(steps, rise, tread))

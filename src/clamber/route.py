@@ -130,7 +130,7 @@ def _sides(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def crossing(
     top: Support, start: np.ndarray, goal: np.ndarray
 ) -> tuple[float, float] | None:
-    """Shares of the way (2,) at which it enters and leaves a top; None: it misses it."""
+    """Shares of the way at which it enters and leaves a top; None: it misses it."""
     A, b = _sides(_corners(top))
     rate, room = A @ (goal - start), b - A @ start
     t0, t1 = 0.0, math.inf

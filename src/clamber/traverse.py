@@ -325,7 +325,7 @@ def _manoeuvre(task: _Task, key: Keyframe) -> tuple[list[_Made], str]:
         if platform.exit is not None and platform.exit.distance(feet) < 0:
             return _climb_down(task, key, platform)
         return _climb(task, key, platform)
-    if is_flight(task.ik.world, platform):
+    if _is_flight(task, platform):
         made, why = _up_stairs(task, key, platform)
         if made or why:
             return made, why
@@ -437,9 +437,13 @@ def _ankles(task: _Task, body: _Frame) -> np.ndarray:
 
 def _climb(task: _Task, key: Keyframe, platform: Platform) -> tuple[list[_Made], str]:
     """The next contacts of a flight of stairs, or all that is left of a climb."""
-    if is_flight(task.ik.world, platform):
+    if _is_flight(task, platform):
         return _up_stairs(task, key, platform)
     return _climb_up(task, key, platform.entry, platform)
+
+
+def _is_flight(task: _Task, platform: Platform) -> bool:
+    return is_flight(task.ik.world, platform, task.goal, task.build.gait)
 
 
 def _up_stairs(
@@ -449,7 +453,9 @@ def _up_stairs(
 
     Where not all of a pair get to their places, all go to their next best.
     """
-    wanted = next_contacts(task.ik.world, platform, key.stance, task.build.gait)
+    wanted = next_contacts(
+        task.ik.world, platform, key.stance, task.goal, task.build.gait
+    )
     some: list[_Made] = []
     why = ""
     for rank in range(max((len(places) for _, places in wanted), default=0)):
