@@ -35,8 +35,6 @@ BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
 LOOK_RANGE = 0.12  # [m] to which distances are looked at, to know when to look again
 ROUNDING = 1e-6  # [m] by which squared distances may be wrong, near 0
 FEW_PAIRS = 40  # that are quicker looked at than bounded
-# Vector products are a[_YZX] b[_ZXY] - a[_ZXY] b[_YZX]: of a few rows, `np.cross` takes
-# five times as long.
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 _ONES = np.ones(9)
 CLEAR = 0.002  # [m] that they keep from boxes at the start
@@ -839,11 +837,11 @@ class Proximity:
 def _nearer_than(near: Proximity, reach: float) -> Proximity:
     keep = (near.distance < reach).nonzero()[0]
     return Proximity(
-        pairs=near.pairs[keep],
-        distance=near.distance[keep],
-        normal=near.normal[keep],
-        first=near.first[keep],
-        second=near.second[keep],
+        pairs=near.pairs.take(keep),
+        distance=near.distance.take(keep),
+        normal=near.normal.take(keep, axis=0),
+        first=near.first.take(keep, axis=0),
+        second=near.second.take(keep, axis=0),
     )
 
 
@@ -884,6 +882,7 @@ class Kinematics:
         self._swing = radius / np.sqrt(2.0)
         # What is known of each pair's distance, and where the geoms were then.
         self._least = np.full(len(world.pairs), -np.inf)
+        self._seen = b"", b""
         self._seen_x, self._seen_R = np.zeros((m.ngeom, 3)), np.zeros((m.ngeom, 9))
         self._geom_x, self._geom_R = self.data.geom_xpos, self.data.geom_xmat
         # What was asked for last, and the answer.
@@ -998,13 +997,13 @@ class Kinematics:
 
     def rolled(self, balls: Balls) -> tuple[np.ndarray, np.ndarray]:
         """(K, 3) `contact_point` and (K, 3) `roll` of all of them."""
-        R, n = self._xmat[balls.bodies], balls.normals
+        R, n = self._xmat.take(balls.bodies, axis=0), balls.normals
         turns = np.empty((len(n), 3, 1))
         for turn, body, link in zip(turns, balls.bodies, balls.links, strict=True):
             mujoco.mju_subQuat(turn[:, 0], self._xquat[body], link)
-        p = self._xpos[balls.bodies] + (R @ balls.centres)[:, :, 0] - balls.radii * n
-        w = balls.radii * (R @ turns)[:, :, 0]
-        return p, w[:, _YZX] * n[:, _ZXY] - w[:, _ZXY] * n[:, _YZX]
+        x = self._xpos.take(balls.bodies, axis=0)
+        p = x + (R @ balls.centres)[:, :, 0] - balls.radii * n
+        return p, _cross(balls.radii * (R @ turns)[:, :, 0], n)
 
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
         """(3,) world rotation vector from the surface's frame to the contact frame."""
@@ -1038,15 +1037,17 @@ class Kinematics:
                 for i, row in zip(idx.tolist(), self._fromto_rows, strict=False)
             ]
         )
-        least[idx] = distance
+        least.put(idx, distance)
         keep = (distance < reach).nonzero()[0]
-        distance, idx = distance[keep], idx[keep]
-        p = self._fromto[keep]
-        apart, touching = distance[:, None], np.abs(distance) < 1e-9
-        if touching.any():
-            apart = np.where(touching, 1.0, distance)[:, None]
+        # `take` is four times as fast as an index array.
+        distance, idx = distance.take(keep), idx.take(keep)
+        p = self._fromto.take(keep, axis=0)
+        apart, touching = distance[:, None], (np.abs(distance) < 1e-9).nonzero()[0]
+        if len(touching):
+            apart = apart.copy()
+            apart[touching] = 1.0
         normal = (p[:, 3:] - p[:, :3]) / apart
-        for i in touching.nonzero()[0]:
+        for i in touching:
             normal[i] = self._touching_normal(idx[i])
         self._asked = reach, active
         self._near = Proximity(
@@ -1079,16 +1080,18 @@ class Kinematics:
             outside = np.maximum(outside, 0.0) ** 2
             away = np.sqrt(outside @ _ONES[:3]) - self._radius
             gap[box] = gap[:, box] = away
-        return gap.ravel()[self._of_pair]
+        return gap.take(self._of_pair)
 
     def _moved(self) -> np.ndarray | None:
         """(P,) the most that pairs can have come nearer since this was last asked.
 
         None where nothing has moved.
         """
-        x, R = self._geom_x - self._seen_x, self._geom_R - self._seen_R
-        if not (x.any() or R.any()):
+        seen = self._geom_x.tobytes(), self._geom_R.tobytes()
+        if seen == self._seen:
             return None
+        self._seen = seen
+        x, R = self._geom_x - self._seen_x, self._geom_R - self._seen_R
         way = np.sqrt((x * x) @ _ONES[:3]) + 1e-9
         way += self._swing * np.sqrt((R * R) @ _ONES)
         self._seen_x[:], self._seen_R[:] = self._geom_x, self._geom_R
@@ -1108,9 +1111,8 @@ class Kinematics:
             normals: (m, 3) from the first geom to the second.
         """
         arm = points - self._root
-        moment = arm[:, _YZX] * normals[:, _ZXY] - arm[:, _ZXY] * normals[:, _YZX]
-        wrench = np.concatenate([moment, normals], axis=1)
-        return (wrench @ self._cdof.T) * self._pair_moves[pairs]
+        wrench = np.concatenate([_cross(arm, normals), normals], axis=1)
+        return (wrench @ self._cdof.T) * self._pair_moves.take(pairs, axis=0)
 
     def _touching_normal(self, pair: int) -> np.ndarray:
         """(3,) from the first geom to the second where their distance is zero."""
@@ -1143,6 +1145,11 @@ class Kinematics:
         out = np.empty(m.nv)
         mujoco.mj_rne(m, d, 0, out)
         return out
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(m, 3) vector products; `np.cross` costs ten times as much on a few rows."""
+    return a.take(_YZX, 1) * b.take(_ZXY, 1) - a.take(_ZXY, 1) * b.take(_YZX, 1)
 
 
 def limb_lengths(kin: Kinematics) -> dict[str, float]:

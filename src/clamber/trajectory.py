@@ -374,53 +374,69 @@ def build_trajectory(
     """
     kin = Kinematics(world)
     surfaces = tuple(world.surfaces)
-    q, v, tau, contact, ends = [], [], [], [], [0]
-
-    def hold(
-        seconds: float, phase: Phase, posture: np.ndarray, torque: np.ndarray
-    ) -> None:
-        n = round(seconds * RATE)
-        q.append(np.tile(posture, (n, 1)))
-        v.append(np.zeros((n, world.model.nv)))
-        tau.append(np.tile(torque, (n, 1)))
-        closed = {c.surface for c in phase.contacts}
-        contact.append(np.tile([s in closed for s in surfaces], (n, 1)))
-
-    samples = 0
-    for i, phase in enumerate(phases):
-        if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
-            raise ValueError(
-                f"phase {i} ({phase.kind}) does not begin where the last one ended"
-            )
-        cruise = np.inf if speed == "max" else speed
-        spline = _spline(kin, phase, cruise, world.v_max)
-        if i == 0:
-            first, _ = spline.sample(np.zeros(1), np.zeros(1))
-            hold(HOLD_START, phase, first[0], spline.tau(0.0))
-        if speed == "max":
-            made = _made(phases, i)
-            s, rate, torque = _fastest(kin, phase, spline, made)
-            rest = TOUCH_REST if made else MIN_REST
-        else:
-            s, rate = _profile(spline.length, spline.cruise).T
-            torque, rest = spline.tau(s), REST
-        qs, vs = spline.sample(s, rate)
-        q.append(qs)
-        v.append(vs)
-        tau.append(torque)
-        closed = {c.surface for c in phase.contacts}
-        contact.append(np.tile([x in closed for x in surfaces], (len(s), 1)))
-        hold(HOLD_END if i == len(phases) - 1 else rest, phase, qs[-1], tau[-1][-1])
-        samples = sum(map(len, q))
-        ends.append(samples - 1)
-    n = samples
+    runs = [_run(kin, phases, i, speed) for i in range(len(phases))]
+    # Sampled into the arrays that are handed over: anything else doubles the memory.
+    n = round(HOLD_START * RATE) + sum(len(x.s) + x.rest for x in runs)
+    q, v = np.empty((n, world.model.nq)), np.zeros((n, world.model.nv))
+    tau = np.empty((n, len(world.joints)))
+    contact = np.empty((n, len(surfaces)), dtype=bool)
+    a, ends = round(HOLD_START * RATE), [0]
+    for run, phase in zip(runs, phases, strict=True):
+        b = a + len(run.s)
+        c = b + run.rest
+        q[a:b], v[a:b] = run.spline.sample(run.s, run.rate)
+        tau[a:b] = run.spline.tau(run.s) if run.tau is None else run.tau
+        q[b:c], tau[b:c] = q[b - 1], tau[b - 1]
+        closed = {x.surface for x in phase.contacts}
+        contact[a:c] = [x in closed for x in surfaces]
+        if phase is phases[0]:
+            first, _ = run.spline.sample(np.zeros(1), np.zeros(1))
+            q[:a], tau[:a], contact[:a] = first[0], run.spline.tau(0.0), contact[a]
+        a = c
+        ends.append(c - 1)
     return Trajectory(
         time=np.arange(n) / RATE,
-        q=np.concatenate(q),
-        v=np.concatenate(v),
-        tau=np.concatenate(tau),
-        contact=np.concatenate(contact),
+        q=q,
+        v=v,
+        tau=tau,
+        contact=contact,
         surfaces=surfaces,
         joints=world.joints,
         keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
     )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Run:
+    """One phase in time: (n,) path parameter and rate, and samples of rest after it."""
+
+    spline: _Spline
+    s: np.ndarray
+    rate: np.ndarray
+    tau: np.ndarray | None  # (n, na); None: the spline's
+    rest: int
+
+
+def _run(
+    kin: Kinematics,
+    phases: Sequence[Phase],
+    i: int,
+    speed: float | Literal["max"],
+) -> _Run:
+    phase = phases[i]
+    if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
+        raise ValueError(
+            f"phase {i} ({phase.kind}) does not begin where the last one ended"
+        )
+    cruise = np.inf if speed == "max" else speed
+    spline = _spline(kin, phase, cruise, kin.world.v_max)
+    torque, rest = None, REST
+    if speed == "max":
+        made = _made(phases, i)
+        s, rate, torque = _fastest(kin, phase, spline, made)
+        rest = TOUCH_REST if made else MIN_REST
+    else:
+        s, rate = _profile(spline.length, spline.cruise).T
+    if i == len(phases) - 1:
+        rest = HOLD_END
+    return _Run(spline, s, rate, torque, round(rest * RATE))

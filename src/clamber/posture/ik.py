@@ -583,7 +583,7 @@ class IK:
         finite = self._counted(problem.clearance)
         reach = float(problem.clearance.max(initial=0.02, where=finite))
         near = kin.proximity(reach, finite)
-        short = problem.clearance[near.pairs] - near.distance
+        short = problem.clearance.take(near.pairs) - near.distance
         worst = int(np.argmax(short)) if len(short) else -1
         points = self._bearing(problem)[1]
         margin = (
@@ -629,7 +629,7 @@ class IK:
         sizes = (e[:, None] @ e[:, :, None]).ravel().tolist()
         room = held.b - (held.A @ p[:, :, None])[:, :, 0]
         near = room < EDGE_RANGE
-        least = room.min(axis=1).tolist()
+        least = [min(x) for x in room.tolist()]
         for goal, i in zip(problem.goals, held.of_goal, strict=True):
             if i is None:
                 self._goal_rows(goal)
@@ -641,7 +641,7 @@ class IK:
                 self._violation += _size(np.minimum(room[i], 0.0))
             inside = None
             if least[i] < EDGE_RANGE:
-                hi = room[i, near[i]]
+                hi = room[i].take(near[i].nonzero()[0])
                 inside = self._ineq.take(len(hi))
                 self._ineq.hi[inside] = hi
                 self._ineq.lo[inside] = -1e30
@@ -652,7 +652,7 @@ class IK:
                 kin.point_jacobian(body, p[i], self._hard.J[k])
                 if inside is not None:
                     jac = kin.point_jacobian(body, centre[i])
-                    self._ineq.J[inside] = held.A[i, near[i]] @ jac
+                    self._ineq.J[inside] = held.A[i].compress(near[i], axis=0) @ jac
 
         self._later(fill)
 
@@ -885,8 +885,9 @@ class IK:
         """
         held = self._held
         if held is not None and held.bears is not None:
-            p = self._at[held.bears]
-            return [held.bodies[i] for i in held.bears], p, p + held.offset[held.bears]
+            p = self._at.take(held.bears, axis=0)
+            bodies = [held.bodies[i] for i in held.bears]
+            return bodies, p, p + held.offset.take(held.bears, axis=0)
         bodies: list[int | None] = []
         points, centres = [], []
         for g in problem.goals:
@@ -984,7 +985,7 @@ class IK:
         near = kin.proximity(reach, self._counted(clearance))
         if len(near.pairs) == 0:
             return
-        short = clearance[near.pairs] - near.distance
+        short = clearance.take(near.pairs) - near.distance
         self._violation += _size(np.maximum(short, 0.0))
         k = self._ineq.take(len(short))
         self._ineq.lo[k] = short
