@@ -23,7 +23,7 @@ from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from clamber.contact import Contact
 from clamber.model import Kinematics, World
 from clamber.path import Phase
-from clamber.posture.keyframe import bearing_frames, holding_limits, torque_limits
+from clamber.posture.keyframe import bearing_frames, torque_limits
 from clamber.retiming import GRID, demand_at, least_torques, retime
 from clamber.se3 import quat_conjugate, quat_multiply
 from clamber.statics import com_margins, contact_forces, support_polygon
@@ -140,23 +140,18 @@ def holding_torque(
     """
     w = kin.world
     kin.update(q)
-    gravity = kin.gravity()
     names, points, normals, mu = bearing_frames(kin, contacts)
     com = kin.com.copy()
-    limits = holding_limits(w)
-    tau, torque = np.zeros(len(w.dadr)), None
+    limits = torque_limits(kin, names, points)
     prices = None if price is None else point_prices(kin, contacts, price)
-    for _ in range(2):
+    tau = np.zeros(len(w.dadr))
+    for torque in (None, limits):
         found = contact_forces(
             points, normals, mu, com, w.mass, torque=torque, price=prices
         )
-        total = gravity
-        for name, p, f in zip(names, points, found.forces, strict=True):
-            total = total - kin.point_jacobian(w.surfaces[name].body, p).T @ f
-        tau = total[w.dadr]
-        if np.all(np.abs(tau) <= limits):
+        tau = limits.torques(found.forces)
+        if np.all(np.abs(tau) <= limits.limits):
             break
-        torque = torque_limits(kin, names, points)
     return np.clip(tau, -w.tau_max, w.tau_max)
 
 

@@ -282,14 +282,19 @@ def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
     return found.residual <= BALANCE_TOL
 
 
-def holding_limits(world: World) -> np.ndarray:
+def holding_limits(world: World, bearing: np.ndarray) -> np.ndarray:
     """(na,) torques that are counted on to hold a posture [N m].
 
-    `EFFORT_SHARE` of the effort limits, less what a contact costs that lies beside
-    where it was planned: `SPARED_ARM` times the weight is 16 mm for one that bears a
-    quarter. To a strong joint that is nothing, to a weak wrist much.
+    `EFFORT_SHARE` of the effort limits; of joints that a contact loads, less what one
+    costs that lies beside where it was planned: `SPARED_ARM` times the weight is 16 mm
+    for one that bears a quarter. To a strong joint that is nothing, to a weak wrist
+    much.
+
+    Args:
+        world: Robot and scene.
+        bearing: (na,) bool, joints that a contact loads.
     """
-    spared = SPARED_ARM * world.mass * GRAVITY
+    spared = SPARED_ARM * world.mass * GRAVITY * bearing
     least = LEAST_SHARE * world.tau_max
     return np.maximum(EFFORT_SHARE * world.tau_max - spared, least)
 
@@ -315,7 +320,7 @@ def torque_limits(
         jacobian=J,
         gravity=kin.gravity(),
         dofs=w.dadr,
-        limits=holding_limits(w),
+        limits=holding_limits(w, J[:, w.dadr].any(axis=0)),
         names=w.joints,
     )
 
