@@ -488,8 +488,14 @@ def test_cycles_without_getting_nearer_are_given_up(robot, monkeypatch):
     world = build_world(robot, scene())
     ik = IK(world)
     key = standing(ik, PlanOptions().keyframe)
-    idle = lambda task, key: ([(key, None, "ac3")], "")  # noqa: E731
-    monkeypatch.setattr(module, "_manoeuvre", idle)
+
+    def back(task, key):
+        """Two centimetres farther away from the goal with every cycle."""
+        away = np.array([-0.02, 0.0, 0.0])
+        stance = tuple(replace(c, position=c.position + away) for c in key.stance)
+        return [(SimpleNamespace(stance=stance), None, "ac3")], ""
+
+    monkeypatch.setattr(module, "_manoeuvre", back)
     found = follow_policy(ik, POLICY, key, PlanOptions(), changes=1000)
     assert "no nearer to the goal" in found.missed
     assert not found.arrived
