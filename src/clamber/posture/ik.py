@@ -347,7 +347,7 @@ class IK:
             self._rough[mine] = np.maximum(self._rough[mine], more)
             self._wary |= mine
         self._is_rough = bool(self._rough.any())
-        self._clearance = self._counts = np.zeros(0)
+        self._clearance, self._counts = b"", np.zeros(0, dtype=bool)
         self._motion = np.zeros((0, 3, nv))
         self._problem: PostureProblem | None = None
         self._held: _Held | None = None
@@ -998,8 +998,9 @@ class IK:
 
     def _counted(self, clearance: np.ndarray) -> np.ndarray:
         """(P,) bool: pairs that count; the same array for the same clearances."""
-        if clearance is not self._clearance:
-            self._clearance, self._counts = clearance, np.isfinite(clearance)
+        known = clearance.tobytes()
+        if known != self._clearance:
+            self._clearance, self._counts = known, np.isfinite(clearance)
         return self._counts
 
     def _roughness_rows(self, problem: PostureProblem) -> None:
