@@ -2,10 +2,11 @@
 
     python benchmarks/bench_traverse.py policy.json scaling.csv scaling.png
 
-Boxes of 0.5 to 8 m, each planned in a process of its own, three times. Rows: the length
-[m], contact changes, CPU seconds (the median), milliseconds a change, seconds of motion,
-the process's peak memory and of that the trajectory [MB], which holds 1000 samples a
-second, and whether the goal was reached. The picture is drawn from them.
+Boxes of 0.5 to 8 m, each planned and saved in a process of its own, three times. Rows:
+the length [m], contact changes, CPU seconds of planning and of writing the run folder
+(medians), milliseconds of planning a change, seconds of motion, the peak memory of the
+process before planning, after it and after saving [MB], and whether the goal was
+reached. The picture is drawn from them.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -39,28 +41,39 @@ def measure(policy: Path, length: float) -> Row:
     goal = np.array([FACE + length + BEYOND, 0.0])
     scene = clamber.Scene(boxes=(box,), start=np.zeros(3), goal=goal)
     robot, general = clamber.load_robot("coman"), clamber.load_policy(policy)
-    began = time.process_time()
+    clock, memory = [time.process_time()], [peak()]
     plan = clamber.plan_traverse(general, robot, scene)
-    spent = time.process_time() - began
+    clock.append(time.process_time())
+    memory.append(peak())
+    with tempfile.TemporaryDirectory() as folder:
+        clamber.save_plan(plan, folder)
+    clock.append(time.process_time())
+    spent, saving = np.diff(clock).tolist()
     t, changes = plan.trajectory, len(plan.paths)
-    arrays = () if t is None else (t.time, t.q, t.v, t.tau, t.contact)
     return {
         "length_m": length,
         "changes": changes,
-        "cpu_s": spent,
+        "plan_s": spent,
         "ms_per_change": 1e3 * spent / max(changes, 1),
+        "save_s": saving,
         "motion_s": 0.0 if t is None else float(t.time[-1]),
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "trajectory_mb": sum(x.nbytes for x in arrays) / 2**20,
+        "before_mb": memory[0],
+        "planned_mb": memory[1],
+        "saved_mb": peak(),
         "complete": plan.complete,
         "why": "; ".join(s.reason for s in plan.skipped),
     }
 
 
+def peak() -> float:
+    """The most memory that this process has had [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def medians(rows: list[Row]) -> Row:
     """Of the times and the memory; the rest is the same in all."""
     out = dict(rows[0])
-    for name in ("cpu_s", "ms_per_change", "peak_mb"):
+    for name in [k for k, v in out.items() if isinstance(v, float)]:
         out[name] = float(np.median([float(r[name]) for r in rows]))
     return {k: round(v, 1) if isinstance(v, float) else v for k, v in out.items()}
 
@@ -70,18 +83,24 @@ def draw(rows: list[Row], path: Path) -> None:
     fig = Figure(figsize=(7.2, 3.0), layout="constrained")
     left, right = fig.subplots(1, 2)
     of = {name: [float(r[name]) for r in rows] for name in rows[0] if name != "why"}
-    left.plot(of["changes"], of["cpu_s"], "o-", color="#1d4ed8")
-    for length, x, y in zip(of["length_m"], of["changes"], of["cpu_s"], strict=True):
-        left.annotate(f"{length:g} m", (x, y), (4, -10), textcoords="offset points")
-    left.set(xlabel="contact changes", ylabel="planning [s]")
-    rest = np.subtract(of["peak_mb"], of["trajectory_mb"])
-    right.plot(of["motion_s"], of["peak_mb"], "o-", color="#1d4ed8", label="at most")
-    right.plot(of["motion_s"], rest, "s-", color="#b91c1c", label="but the trajectory")
-    right.set(xlabel="motion [s]", ylabel="memory [MB]")
-    right.legend(frameon=False, fontsize=8)
+    left.plot(of["changes"], of["plan_s"], "o-", color="#1d4ed8", label="planning")
+    for length, x, y in zip(of["length_m"], of["changes"], of["plan_s"], strict=True):
+        if length >= 2:  # shorter ones are next to each other
+            left.annotate(f"{length:g} m", (x, y), (4, -10), textcoords="offset points")
+    left.set(xlabel="contact changes", ylabel="CPU time [s]")
+    for name, mark, colour in (
+        ("before", "^", "#6b7280"),
+        ("planned", "o", "#1d4ed8"),
+        ("saved", "s", "#b91c1c"),
+    ):
+        memory = of[f"{name}_mb"]
+        right.plot(of["changes"], memory, f"{mark}-", color=colour, label=name)
+    right.set(xlabel="contact changes", ylabel="peak memory [MB]")
     for ax in (left, right):
         ax.set(xlim=(0, None), ylim=(0, None))
         finish_axes(ax)
+    right.legend(frameon=False, fontsize=8, loc="lower right")
+    left.legend(frameon=False, fontsize=8, loc="upper left")
     save_plot(fig, path)
 
 
