@@ -71,7 +71,7 @@ def test_difference_quotients_converge_to_the_velocity_with_second_order(
 def test_velocity_error_sees_a_velocity_in_the_wrong_frame(demo_plan, demo_kinematics):
     """The base's angular velocity is in its own frame; in the world's it is wrong."""
     trajectory = demo_plan.trajectory
-    wrong = trajectory.v.copy()
+    wrong = np.array(trajectory.v)
     for k in range(len(wrong)):
         demo_kinematics.data.qpos[:] = trajectory.q[k]
         w, x, y, z = trajectory.q[k, 3:7]

@@ -93,9 +93,7 @@ class Tracking:
         assert plan.trajectory is not None
         self._trajectory = plan.trajectory
         self._law = JointLaw(world)
-        self._q = plan.trajectory.q[:, world.qadr]
-        self._v = plan.trajectory.v[:, world.dadr]
-        self._qadr = world.qadr
+        self._qadr, self._dadr = world.qadr, world.dadr
         self._k = -1
         self.events: list[Event] = []
         self.stopped = ""
@@ -106,9 +104,9 @@ class Tracking:
     def command(self, measured: Measurement) -> np.ndarray:
         """(na,) servo command of the next physics step."""
         self._k = k = self._k + 1
-        return self._law.command(
-            self._q[k], self._v[k], self._trajectory.tau[k], measured.q[self._qadr]
-        )
+        t = self._trajectory
+        q, v = t.q[k, self._qadr], t.v[k, self._dadr]
+        return self._law.command(q, v, t.tau[k], measured.q[self._qadr])
 
     @property
     def reference(self) -> np.ndarray:

@@ -49,7 +49,7 @@ from clamber.scene import Box, Scene, input_error, read_yaml
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
 from clamber.statics import Phase, StaticEquilibrium
-from clamber.trajectory import Trajectory
+from clamber.trajectory import Samples, Trajectory
 
 VERSION = 1
 SEQUENCE = "sequence.json"
@@ -252,9 +252,18 @@ def _maker(path: Path) -> str:
 
 
 def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    content: dict[str, Any] = {k: np.asarray(v) for k, v in arrays.items()}
-    with _whole(path) as stream:
-        np.savez_compressed(stream, **content)
+    """As `np.savez_compressed` does; what is sampled, block after block."""
+    kind = zipfile.ZIP_DEFLATED
+    with _whole(path) as stream, zipfile.ZipFile(stream, "w", kind) as archive:
+        for name, x in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                if not isinstance(x, Samples):
+                    np.lib.format.write_array(file, np.asarray(x), allow_pickle=False)
+                    continue
+                about = {"descr": "<f8", "fortran_order": False, "shape": x.shape}
+                np.lib.format.write_array_header_1_0(file, about)
+                for block in x.blocks():
+                    file.write(block.astype("<f8").tobytes())
 
 
 class _Arrays:

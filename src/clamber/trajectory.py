@@ -12,10 +12,11 @@ posture, those of leaving contacts ever dearer, and are interpolated along the s
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
@@ -46,22 +47,99 @@ TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
 
 
+Sampling = Callable[[int], Sequence[np.ndarray]]
+
+
+class Samples:
+    """(T, n) rows that are sampled when they are asked for, block after block.
+
+    Indexed as an array is, by rows and then by columns; `np.asarray` gives all of it.
+    The last block is kept, so that neighbouring rows cost no more than those of an
+    array: a reference of 1000 samples a second takes no memory.
+    """
+
+    def __init__(self, sample: Sampling, which: int, ends: np.ndarray, n: int) -> None:
+        """Rows of one of the arrays (m, n) that `sample` gives for each block.
+
+        Args:
+            sample: By the number of the block; called again where it was left.
+            which: Of its arrays.
+            ends: (B,) the row at which each block ends.
+            n: Columns.
+        """
+        self.shape = int(ends[-1]), n
+        self._sample, self._which, self._ends = sample, which, ends
+        self._starts = np.concatenate([[0], ends[:-1]])
+        self._from = self._to = 0
+        self._block = np.zeros((0, n))
+
+    def __len__(self) -> int:
+        """T."""
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Rows, and columns of them where there are two indices."""
+        rows, *columns = key if isinstance(key, tuple) else (key,)
+        if isinstance(rows, (int, np.integer)):
+            k = int(rows) + (len(self) if rows < 0 else 0)
+            if not self._from <= k < self._to:
+                if not 0 <= k < len(self):
+                    raise IndexError(f"row {rows} of {len(self)}")
+                self._look(int(np.searchsorted(self._ends, k, side="right")))
+            out = self._block[k - self._from]
+            return out[columns[0]] if columns else out
+        if isinstance(rows, slice):
+            index = np.arange(*rows.indices(len(self)))
+        else:
+            index = np.asarray(rows)
+            index = np.flatnonzero(index) if index.dtype == bool else index % len(self)
+        out = np.empty((len(index), self.shape[1]))
+        block = np.searchsorted(self._ends, index, side="right")
+        for i in np.unique(block):
+            mine = block == i
+            self._look(int(i))
+            out[mine] = self._block[index[mine] - self._from]
+        return out[:, columns[0]] if columns else out
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Row after row."""
+        for block in self.blocks():
+            yield from block
+
+    def __array__(
+        self, dtype: np.dtype | None = None, copy: bool | None = None
+    ) -> np.ndarray:
+        """All rows."""
+        return np.array(self[:], dtype=dtype)
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """(m, n) the rows of one block after the other."""
+        for i in range(len(self._ends)):
+            self._look(i)
+            yield self._block
+
+    def _look(self, i: int) -> None:
+        self._block = self._sample(i)[self._which]
+        self._from, self._to = int(self._starts[i]), int(self._ends[i])
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Trajectory:
     """A timed reference.
 
     Attributes:
         time: (T,) [s]; q: (T, nq); v: (T, nv) the derivative of q on the manifold.
-        tau: (T, na) feed-forward joint torques [N m].
+        tau: (T, na) feed-forward joint torques [N m]. As planned, these three are
+            sampled when they are asked for.
         contact: (T, nS) bool, closed contacts by `surfaces`.
         joints: (na,) names.
         keyframes: (K,) time at which each keyframe is reached [s].
     """
 
     time: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    tau: np.ndarray
+    q: np.ndarray | Samples
+    v: np.ndarray | Samples
+    tau: np.ndarray | Samples
     contact: np.ndarray
     surfaces: tuple[str, ...]
     joints: tuple[str, ...]
@@ -74,7 +152,8 @@ class Trajectory:
             x = getattr(self, name)
             if len(x) != n:
                 raise ValueError(f"{name} has {len(x)} rows, expected {n}")
-            x.setflags(write=False)
+            if isinstance(x, np.ndarray):
+                x.setflags(write=False)
 
     def at(self, t: float) -> int:
         """Index of the sample at time `t` [s], clipped to the ends."""
@@ -370,31 +449,23 @@ def build_trajectory(
     kin = Kinematics(world)
     surfaces = tuple(world.surfaces)
     runs = [_run(kin, phases, i, speed) for i in range(len(phases))]
-    # Sampled into the arrays that are handed over: anything else doubles the memory.
-    n = round(HOLD_START * RATE) + sum(len(x.s) + x.rest for x in runs)
-    q, v = np.empty((n, world.model.nq)), np.zeros((n, world.model.nv))
-    tau = np.empty((n, len(world.joints)))
-    contact = np.empty((n, len(surfaces)), dtype=bool)
-    a, ends = round(HOLD_START * RATE), [0]
-    for run, phase in zip(runs, phases, strict=True):
-        b = a + len(run.s)
-        c = b + run.rest
-        q[a:b], v[a:b] = run.spline.sample(run.s, run.rate)
-        tau[a:b] = run.spline.tau(run.s) if run.tau is None else run.tau
-        q[b:c], tau[b:c] = q[b - 1], tau[b - 1]
-        closed = {x.surface for x in phase.contacts}
-        contact[a:c] = [x in closed for x in surfaces]
-        if phase is phases[0]:
-            first, _ = run.spline.sample(np.zeros(1), np.zeros(1))
-            q[:a], tau[:a], contact[:a] = first[0], run.spline.tau(0.0), contact[a]
-        a = c
-        ends.append(c - 1)
+    lengths = [x.lead + x.n + x.rest for x in runs]
+    stops, n = np.cumsum(lengths), sum(lengths)
+    closed = [{c.surface for c in phase.contacts} for phase in phases]
+    flags = np.array([[s in c for s in surfaces] for c in closed])
+    ends = [0, *(stops - 1).tolist()]
+
+    @functools.lru_cache(maxsize=1)
+    def moving(i: int) -> tuple[np.ndarray, np.ndarray]:
+        return runs[i].motion()
+
+    model = world.model
     return Trajectory(
         time=np.arange(n) / RATE,
-        q=q,
-        v=v,
-        tau=tau,
-        contact=contact,
+        q=Samples(moving, 0, stops, model.nq),
+        v=Samples(moving, 1, stops, model.nv),
+        tau=Samples(lambda i: (runs[i].torques(),), 0, stops, len(world.joints)),
+        contact=np.repeat(flags, lengths, axis=0),
         surfaces=surfaces,
         joints=world.joints,
         keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
@@ -403,13 +474,45 @@ def build_trajectory(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Run:
-    """One phase in time: (n,) path parameter and rate, and samples of rest after it."""
+    """One phase in time, with samples of rest before and after it.
+
+    How far along the path it is and how fast, (2, n), and the torques (n, na) are kept
+    where they are not those of the profile and of the spline.
+    """
 
     spline: _Spline
-    s: np.ndarray
-    rate: np.ndarray
-    tau: np.ndarray | None  # (n, na); None: the spline's
+    n: int
+    timing: np.ndarray | None
+    tau: np.ndarray | None
+    lead: int
     rest: int
+
+    def motion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Configurations and velocities, rest included."""
+        s, rate = self._timing()
+        q, v = self.spline.sample(s, rate)
+        if self.lead:
+            first, _ = self.spline.sample(np.zeros(1), np.zeros(1))
+            q = np.concatenate([np.repeat(first, self.lead, axis=0), q])
+        still = np.zeros((self.lead, v.shape[1])), np.zeros((self.rest, v.shape[1]))
+        q = np.concatenate([q, np.repeat(q[-1:], self.rest, axis=0)])
+        v = np.concatenate([still[0], v, still[1]])
+        q.setflags(write=False)
+        v.setflags(write=False)
+        return q, v
+
+    def torques(self) -> np.ndarray:
+        """Feed-forward torques, rest included."""
+        tau = self.spline.tau(self._timing()[0]) if self.tau is None else self.tau
+        first = np.repeat(self.spline.tau(np.zeros(1)), self.lead, axis=0)
+        tau = np.concatenate([first, tau, np.repeat(tau[-1:], self.rest, axis=0)])
+        tau.setflags(write=False)
+        return tau
+
+    def _timing(self) -> np.ndarray:
+        if self.timing is not None:
+            return self.timing
+        return _profile(self.spline.length, self.spline.cruise).T
 
 
 def _run(
@@ -425,13 +528,15 @@ def _run(
         )
     cruise = np.inf if speed == "max" else speed
     spline = _spline(kin, phase, cruise, kin.world.v_max)
-    torque, rest = None, REST
+    timing = torque = None
     if speed == "max":
         made = _made(phases, i)
         s, rate, torque = _fastest(kin, phase, spline, made)
+        timing, n = np.stack([s, rate]), len(s)
         rest = TOUCH_REST if made else MIN_REST
     else:
-        s, rate = _profile(spline.length, spline.cruise).T
+        n, rest = len(_profile(spline.length, spline.cruise)), REST
     if i == len(phases) - 1:
         rest = HOLD_END
-    return _Run(spline, s, rate, torque, round(rest * RATE))
+    lead = 0 if i else round(HOLD_START * RATE)
+    return _Run(spline, n, timing, torque, lead, round(rest * RATE))

@@ -591,7 +591,11 @@ def climb_sheet(
 
 def _some(x: np.ndarray, n: int) -> np.ndarray:
     """About `n` rows, evenly spaced, the last one among them."""
-    return x[np.unique(np.linspace(0, len(x) - 1, min(n, len(x))).round().astype(int))]
+    return x[_evenly(len(x), n)]
+
+
+def _evenly(length: int, n: int) -> np.ndarray:
+    return np.unique(np.linspace(0, length - 1, min(n, length)).round().astype(int))
 
 
 @functools.cache
@@ -1129,7 +1133,8 @@ def render_frame(
     path = folder / f"frame-{time:g}.png" if out is None else Path(out)
     if path.suffix != ".png":
         raise InputError("a name that ends in .png", source=path)
-    view = view_of(world, _some(q, 60), size[0] / size[1], camera)
+    some = q[_evenly(len(q), 60)]
+    view = view_of(world, some, size[0] / size[1], camera)
     with Camera(world, size, cutout=transparent) as drawing:
         draw = drawing.cutout if transparent else drawing.shot
         picture = draw(q[row], view)

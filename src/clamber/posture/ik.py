@@ -29,7 +29,7 @@ import mujoco
 import numpy as np
 
 from clamber.errors import Status
-from clamber.model import Balls, Kinematics, Proximity, Surface, World
+from clamber.model import Balls, Kinematics, Surface, World
 from clamber.scene import Support
 from clamber.se3 import frame_from_normal, matrix_from_quat, rotation_vector
 from clamber.statics import (
@@ -347,7 +347,7 @@ class IK:
             self._rough[mine] = np.maximum(self._rough[mine], more)
             self._wary |= mine
         self._is_rough = bool(self._rough.any())
-        self._clearance = self._counts = np.zeros(0)
+        self._clearance, self._counts = b"", np.zeros(0, dtype=bool)
         self._motion = np.zeros((0, 3, nv))
         self._problem: PostureProblem | None = None
         self._held: _Held | None = None
@@ -606,8 +606,8 @@ class IK:
             com_margin=float(margin),
         )
 
-    # Rows, one method for each kind of task. What a row asks for is put down at once; its
-    # Jacobian is left to a function that `_linearise` calls where it is needed.
+    # Rows, one method for each kind of task. What a row asks for is put down at once;
+    # its Jacobian is left to a function that `_linearise` calls where it is needed.
 
     def _look(self, problem: PostureProblem) -> None:
         """Where the held round contacts of this problem are, all of them at once."""
@@ -858,9 +858,7 @@ class IK:
         self._later(fill)
 
     def _middle_jacobian(self, places: _Places, out: np.ndarray) -> np.ndarray:
-        """(3, nv) each place moves with its own body: where one turns, the middle may
-        stay.
-        """
+        """(3, nv): each place moves with its own body."""
         (body, p), *more = places
         self.kin.point_jacobian(body, p, out)
         for body, p in more:
@@ -998,8 +996,9 @@ class IK:
 
     def _counted(self, clearance: np.ndarray) -> np.ndarray:
         """(P,) bool: pairs that count; the same array for the same clearances."""
-        if clearance is not self._clearance:
-            self._clearance, self._counts = clearance, np.isfinite(clearance)
+        known = clearance.tobytes()
+        if known != self._clearance:
+            self._clearance, self._counts = known, np.isfinite(clearance)
         return self._counts
 
     def _roughness_rows(self, problem: PostureProblem) -> None:
