@@ -333,31 +333,50 @@ def _replanned(
             made = plan(a.sequence, robot, scene, options=options)
         planned.append((a, made))
     report("replan", 1.0, "")
-    ranked = _ranked(planned)
     explored = None
-    if not ranked[0].stable:
+    if not any(made.complete for _, made in planned):
         ik = IK(build_world(robot, scene))
         for a in stand_ins(sequence, robot):
             report("replan", 1.0, ", ".join(a.surfaces))
             planned.append((a, _planned_once(ik, a.sequence, options)))
             if planned[-1][1].complete:
                 break
-        ranked = _ranked(planned)
-    if not ranked[0].stable:
-        goal = retarget(sequence, ik.world)
-        stuck = max((_reached(r.plan) for r in ranked), key=lambda x: len(x.steps))
-        for start in (stuck, None) if stuck.steps else (None,):
-            explored = _explored(ik, goal, options, bounds, counts, start, report)
-            if explored is None or explored.sequence is not None:
-                break
-        if explored is not None and explored.sequence is not None:
-            made = _plan_of(ik.world, options, explored.sequence, explored)
-            names = _surfaces(explored)
-            found = Alternative(surfaces=names, sequence=explored.sequence)
-            ranked = (*_ranked([(found, made)]), *ranked)
+        else:
+            made = [p for _, p in planned]
+            explored = _search_on(ik, sequence, made, options, bounds, counts, report)
+            if explored is not None and explored.sequence is not None:
+                found = Alternative(
+                    surfaces=_surfaces(explored), sequence=explored.sequence
+                )
+                plan_found = _plan_of(ik.world, options, explored.sequence, explored)
+                planned.append((found, plan_found))
+    ranked = _ranked(planned)
     return Replanned(
         differences=contact_differences(sequence), ranked=ranked, explored=explored
     )
+
+
+def _search_on(
+    ik: IK,
+    sequence: ContactSequence,
+    made: Sequence[Plan],
+    options: PlanOptions,
+    bounds: Bounds | None,
+    counts: Counts | None,
+    report: Progress,
+) -> Explored | None:
+    """What the search finds from where the plan that came farthest is stuck.
+
+    Where that is nothing, or none came anywhere, what it finds from the start.
+    """
+    goal = retarget(sequence, ik.world)
+    stuck = max(map(_reached, made), key=lambda x: len(x.steps))
+    explored = None
+    for start in (stuck, None) if stuck.steps else (None,):
+        explored = _explored(ik, goal, options, bounds, counts, start, report)
+        if explored is None or explored.sequence is not None:
+            break
+    return explored
 
 
 def _planned_once(ik: IK, sequence: ContactSequence, options: PlanOptions) -> Plan:

@@ -409,7 +409,7 @@ def _fastest(
     bend = _bend(spline.curve, s[look])
     tau = []
     for i, k in enumerate(look):
-        contacts, price = handed_over(phase, s[k] / spline.length)
+        contacts, price = handed_over(phase, float(s[k]) / spline.length)
         demand = demand_at(kin, q[i], slope[i], bend[i], contacts)
         prices = point_prices(kin, contacts, price)
         squared = float(rate[k] ** 2)

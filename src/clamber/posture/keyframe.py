@@ -320,7 +320,7 @@ def torque_limits(
         jacobian=J,
         gravity=kin.gravity(),
         dofs=w.dadr,
-        limits=holding_limits(w, J[:, w.dadr].any(axis=0)),
+        limits=holding_limits(w, np.abs(J[:, w.dadr]).max(axis=0) > 0.0),
         names=w.joints,
     )
 
