@@ -11,6 +11,7 @@ import pytest
 from clamber import traverse
 from clamber.contact import Contact
 from clamber.model import build_world, load_robot
+from clamber.path import interpolate, overlap, watched_pairs
 from clamber.pipeline import PlanOptions
 from clamber.posture.ik import IK
 from clamber.route import BORDER, Place, find_platforms
@@ -276,17 +277,18 @@ def climbing():
     ik = IK(build_world(load_robot("coman"), stairs(3, 0.15, 0.25)))
     task = traverse._task(ik, POLICY, PlanOptions())
     (platform,) = task.platforms
-    keys = [standing(ik, task.options.keyframe)]
-    for _ in range(2):
+    keys, paths = [standing(ik, task.options.keyframe)], []
+    for _ in range(4):
         made, why = traverse._up_stairs(task, keys[-1], platform)
         assert not why
         keys += [key for key, _, _ in made]
-    return task, platform, keys
+        paths += [path for _, path, _ in made]
+    return task, platform, keys, paths
 
 
 def test_hands_then_feet_get_to_their_places(climbing):
-    _, _, keys = climbing
-    assert len(keys) == 5
+    _, _, keys, _ = climbing
+    assert len(keys) == 9
     hands, feet = keys[2].stance, keys[4].stance
     assert {c.support for c in hands} == {GROUND, "s2"}
     assert {f"{c.surface}@{c.support}" for c in feet} == {
@@ -296,7 +298,7 @@ def test_hands_then_feet_get_to_their_places(climbing):
 
 def test_the_weight_is_between_hands_and_feet(climbing):
     """Not over the hands, where legs that come after them would push it."""
-    task, _, keys = climbing
+    task, _, keys, _ = climbing
     stance = keys[4].stance
     middle = traverse._middle(task, stance)
     x = {c.surface: c.position[0] for c in stance}
@@ -305,8 +307,28 @@ def test_the_weight_is_between_hands_and_feet(climbing):
     assert keys[4].com_margin > 0.08
 
 
+def test_a_limb_that_goes_up_does_not_graze_the_riser_of_its_tread(climbing):
+    """Between postures too, where it is not about to leave or to touch."""
+    task, _, _, paths = climbing
+    assert len(paths) == 8
+    for path in paths:
+        swing = path.phases[1]
+        watched = watched_pairs(task.ik.world, swing.contacts)
+        start, end = swing.arc[0], swing.arc[-1]
+        for a, b in itertools.pairwise(swing.q):
+            q = interpolate(task.ik.kin, a, b, 0.5)
+            task.ik.kin.update(q)
+            p = task.ik.kin.contact_point(
+                path.transition.move.makes.surface, np.array([0.0, 0.0, 1.0])
+            )
+            away = min(np.linalg.norm(p - start), np.linalg.norm(p - end))
+            if away > 0.25 * np.linalg.norm(end - start):
+                depth, _ = overlap(task.ik, q, watched)
+                assert depth < 0.0015
+
+
 def test_the_upright_posture_closes_its_contacts(climbing):
-    task, _, keys = climbing
+    task, _, keys, _ = climbing
     key = keys[4]
     here = next(c for c in key.stance if c.surface == "LHand")
     place = Place(support="s2", position=here.position + np.array([0.04, 0, 0]))
@@ -324,7 +346,7 @@ def test_the_upright_posture_closes_its_contacts(climbing):
 
 
 def test_a_pair_that_does_not_fit_goes_to_its_next_places(climbing, monkeypatch):
-    task, platform, keys = climbing
+    task, platform, keys, _ = climbing
     near, far = (
         Place(support="s1", position=np.array([x, 0.0, 0.15])) for x in (0.35, 0.45)
     )

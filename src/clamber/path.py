@@ -38,6 +38,7 @@ DRIFT_LIMIT = 0.01  # [m] at most, anywhere on the path
 OVERLAP_TOL = 0.001  # [m] links that enter another by more refine the path
 OVERLAP_LIMIT = 0.004  # [m] at most, anywhere on the path
 MAX_REFINEMENTS = 4  # halvings between two postures
+ENDS = 5.0  # a swing's first and last fifth: supports of what moves may be touched
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -256,7 +257,7 @@ def _swing_clearance(
     At lift-off and touch-down the limb is as near to the supports as the end postures
     are; asking for the full distance at once would tear it off them sideways.
     """
-    ramp = min(1.0, 5.0 * s, 5.0 * (1.0 - s))
+    ramp = min(1.0, ENDS * s, ENDS * (1.0 - s))
     if ramp >= 1.0:
         return clearance
     ik.kin.update(t.shifted if s < 0.5 else t.touching)
@@ -304,10 +305,11 @@ def _fill(
         node: Posture at a share of the way, given the one before, or given the middle
             of a gap (True) that it should stay near.
         contacts: Closed all the way.
-        moving: Contacts at either end of the way, which may touch their supports.
+        moving: Contacts at either end of the way, which may touch their supports there.
         refine: Halve gaps at all.
     """
-    watched = watched_pairs(ik.world, (*contacts, *moving))
+    aloft = watched_pairs(ik.world, contacts)
+    low = watched_pairs(ik.world, (*contacts, *moving))
     nodes = [(0.0, a)]
     for share in np.linspace(0.0, 1.0, points)[1:-1]:
         nodes.append((float(share), node(float(share), nodes[-1][1], False)))
@@ -315,10 +317,10 @@ def _fill(
     for _ in range(MAX_REFINEMENTS if refine else 0):
         out = [nodes[0]]
         for (s0, q0), (s1, q1) in itertools.pairwise(nodes):
-            middle = interpolate(ik.kin, q0, q1, 0.5)
-            depth, _ = overlap(ik, middle, watched)
+            middle, share = interpolate(ik.kin, q0, q1, 0.5), 0.5 * (s0 + s1)
+            inner = ENDS * min(share, 1.0 - share) >= 1.0
+            depth, _ = overlap(ik, middle, aloft if inner else low)
             if _drift(ik, contacts) > DRIFT_TOL or depth > OVERLAP_TOL:
-                share = 0.5 * (s0 + s1)
                 out.append((share, node(share, middle, True)))
             out.append((s1, q1))
         if len(out) == len(nodes):
