@@ -69,9 +69,8 @@ class Samples:
         """
         self.shape = int(ends[-1]), n
         self._sample, self._which, self._ends = sample, which, ends
-        self._starts = np.concatenate([[0], ends[:-1]])
-        self._from = self._to = 0
-        self._block = np.zeros((0, n))
+        # From which row on, and the rows: one value, for who reads in several threads.
+        self._held = 0, np.zeros((0, n))
 
     def __len__(self) -> int:
         """T."""
@@ -82,11 +81,12 @@ class Samples:
         rows, *columns = key if isinstance(key, tuple) else (key,)
         if isinstance(rows, (int, np.integer)):
             k = int(rows) + (len(self) if rows < 0 else 0)
-            if not self._from <= k < self._to:
+            start, block = self._held
+            if not start <= k < start + len(block):
                 if not 0 <= k < len(self):
                     raise IndexError(f"row {rows} of {len(self)}")
-                self._look(int(np.searchsorted(self._ends, k, side="right")))
-            out = self._block[k - self._from]
+                start, block = self._look(np.searchsorted(self._ends, k, side="right"))
+            out = block[k - start]
             return out[columns[0]] if columns else out
         if isinstance(rows, slice):
             index = np.arange(*rows.indices(len(self)))
@@ -94,11 +94,11 @@ class Samples:
             index = np.asarray(rows)
             index = np.flatnonzero(index) if index.dtype == bool else index % len(self)
         out = np.empty((len(index), self.shape[1]))
-        block = np.searchsorted(self._ends, index, side="right")
-        for i in np.unique(block):
-            mine = block == i
-            self._look(int(i))
-            out[mine] = self._block[index[mine] - self._from]
+        number = np.searchsorted(self._ends, index, side="right")
+        for i in np.unique(number):
+            mine = number == i
+            start, block = self._look(i)
+            out[mine] = block[index[mine] - start]
         return out[:, columns[0]] if columns else out
 
     def __iter__(self) -> Iterator[np.ndarray]:
@@ -115,12 +115,12 @@ class Samples:
     def blocks(self) -> Iterator[np.ndarray]:
         """(m, n) the rows of one block after the other."""
         for i in range(len(self._ends)):
-            self._look(i)
-            yield self._block
+            yield self._look(i)[1]
 
-    def _look(self, i: int) -> None:
-        self._block = self._sample(i)[self._which]
-        self._from, self._to = int(self._starts[i]), int(self._ends[i])
+    def _look(self, i: int | np.integer) -> tuple[int, np.ndarray]:
+        block = self._sample(int(i))[self._which]
+        self._held = int(self._ends[i]) - len(block), block
+        return self._held
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
