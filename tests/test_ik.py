@@ -1247,3 +1247,42 @@ def test_kinematics_of_the_workspace_are_left_at_the_posture(ik):
     fresh = Kinematics(w)
     fresh.update(q)
     np.testing.assert_array_equal(ik.kin.com, fresh.com)
+
+
+def test_held_contacts_are_the_same_whatever_problem_came_before(plain):
+    """Rows of round contacts are made together, and kept while a problem is solved."""
+    w, q = plain.world, bent(plain.world, 4)
+    plain.kin.update(q)
+    names = ("LKnee", "RKnee", "LElbow", "RElbow")
+    problems = []
+    for held in (names[:2], names[1:], names):
+        goals = []
+        for name in held:
+            s = w.surfaces[name]
+            p = plain.kin.contact_point(name, np.array([0.0, 0.0, 1.0]))
+            link = quat_from_matrix(plain.kin.rotation(s.body))
+            goals.append(
+                ContactGoal(
+                    surface=name,
+                    support="box",
+                    position=p + 0.01,
+                    rotation=np.eye(3),
+                    link=link,
+                )
+            )
+        problems.append(problem_of(w, *goals, balance=True))
+    later = plain.kin.integrate(q, np.full(w.model.nv, 0.05))
+    for problem in (*problems, *problems[::-1]):
+        for posture in (q, later, q):
+            qp, fresh = plain.build(problem, posture), IK(w).build(problem, posture)
+            for name in ("H", "c", "C", "e", "A", "lo", "hi"):
+                np.testing.assert_array_equal(getattr(qp, name), getattr(fresh, name))
+            assert qp.merit == fresh.merit
+    # Each of them is open by what it was put aside, and stays on its support.
+    qp = plain.build(problems[-1], q)
+    np.testing.assert_allclose(qp.e, 0.01, atol=1e-9)
+    A, b = w.supports["box"].edges()
+    for g in problems[-1].goals:
+        p = plain.kin.contact_point(g.surface, w.supports["box"].normal)
+        room = b - EDGE_INSET - A @ p
+        assert all(np.isclose(qp.hi, x).any() for x in room[room < 0.15])

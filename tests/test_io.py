@@ -22,6 +22,7 @@ from clamber.pipeline import Plan, Skipped
 from clamber.scene import Box, Scene
 from clamber.se3 import matrix_from_rpy
 from clamber.simulation import Criterion, Rollout, Verdict
+from clamber.trajectory import Samples
 
 HEIGHT = 0.25
 
@@ -78,6 +79,7 @@ def rollout(plan: Plan) -> Rollout:
 
 def same(a: object, b: object) -> bool:
     """Whether two records hold the same, to the last bit."""
+    a, b = (np.asarray(x) if isinstance(x, Samples) else x for x in (a, b))
     if isinstance(a, np.ndarray):
         return (
             isinstance(b, np.ndarray)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from clamber.errors import InputError
 from clamber.model import (
     ROBOTS,
+    Balls,
     Kinematics,
     World,
     build_world,
@@ -822,6 +823,46 @@ def test_a_flat_error_is_the_turn_that_would_lay_it_flat(world):
 
 
 # Distances that are not looked at.
+
+
+def test_balls_together_are_where_they_are_alone(tilted):
+    kin, q = Kinematics(tilted), random_posture(tilted, 3)
+    kin.update(q)
+    names = [n for n, s in tilted.surfaces.items() if not s.is_flat]
+    surfaces = [tilted.surfaces[n] for n in names]
+    links = [quat_from_matrix(kin.rotation(s.body)) for s in surfaces]
+    normal = matrix_from_rpy([0.2, -0.3, 0.0])[:, 2]
+    balls = Balls(
+        bodies=np.array([s.body for s in surfaces]),
+        centres=np.array([s.centre for s in surfaces])[:, :, None],
+        radii=np.array([[s.radius] for s in surfaces]),
+        normals=np.array([normal] * len(names)),
+        links=np.array(links),
+    )
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        q = kin.integrate(q, 0.2 * rng.normal(size=tilted.model.nv))
+        kin.update(q)
+        points, rolled = kin.rolled(balls)
+        for i, name in enumerate(names):
+            np.testing.assert_array_equal(points[i], kin.contact_point(name, normal))
+            np.testing.assert_array_equal(rolled[i], kin.roll(name, normal, links[i]))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_what_is_asked_again_is_answered_again(tilted, seed):
+    """Less far, at the same posture: as if it were asked for the first time."""
+    used, q = Kinematics(tilted), random_posture(tilted, seed)
+    active = np.random.default_rng(seed).random(len(tilted.pairs)) < 0.8
+    used.update(q)
+    for reach in (0.1, 0.1, 0.02, 0.05, 0.0):
+        used.update(q)
+        fresh = Kinematics(tilted)
+        fresh.update(q)
+        a, b = used.proximity(reach, active), fresh.proximity(reach, active)
+        for field in ("pairs", "distance", "normal", "first", "second"):
+            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    assert len(used.proximity(0.1).pairs) > len(used.proximity(0.1, active).pairs)
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.02, 0.5])

@@ -23,6 +23,7 @@ from clamber.statics import (
     contact_forces,
     contact_frames,
     contact_phase,
+    ellipse_excess,
     is_statically_stable,
     polygon_halfplanes,
     projected_distance,
@@ -283,6 +284,16 @@ def test_the_ellipse_has_the_axes_of_the_second_moments_of_area():
     assert ellipse.semi_axes[0] / ellipse.semi_axes[1] == pytest.approx(ratio, rel=5e-3)
     along = ellipse.foci[1] - ellipse.foci[0]
     assert abs(along @ vectors[:, 1]) == pytest.approx(np.linalg.norm(along), rel=1e-3)
+
+
+def test_the_excess_needs_no_record():
+    rng = np.random.default_rng(6)
+    for n in (1, 2, 3, 4, 9):
+        polygon, com = support_polygon(rng.normal(size=(n, 2))), rng.normal(size=3)
+        excess, gradient = ellipse_excess(polygon, com)
+        wanted = support_ellipse(polygon).excess(com)
+        assert excess == wanted[0]
+        assert np.array_equal(gradient, wanted[1])
 
 
 def test_the_gradient_of_the_excess_matches_finite_differences():

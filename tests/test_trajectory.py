@@ -17,6 +17,7 @@ from clamber.trajectory import (
     HOLD_END,
     HOLD_START,
     RATE,
+    Samples,
     build_trajectory,
     handed_over,
     holding_torque,
@@ -336,8 +337,47 @@ def test_arrays_of_different_length_are_refused(demo_plan):
 
 
 def test_arrays_are_read_only(demo_plan):
+    row = demo_plan.trajectory.q[0]
     with pytest.raises(ValueError, match="read-only"):
-        demo_plan.trajectory.q[0, 0] = 1.0
+        row[0] = 1.0
+    arrays = replace(demo_plan.trajectory, q=np.array(demo_plan.trajectory.q))
+    assert isinstance(arrays.q, np.ndarray)
+    with pytest.raises(ValueError, match="read-only"):
+        arrays.q[0, 0] = 1.0
+
+
+@pytest.mark.parametrize("name", ["q", "v", "tau"])
+def test_what_is_sampled_when_asked_for_is_indexed_as_an_array_is(demo_plan, name):
+    x = getattr(demo_plan.trajectory, name)
+    assert isinstance(x, Samples)
+    every = np.concatenate(list(x.blocks()))
+    assert every.shape == x.shape == (len(demo_plan.trajectory.time), x.shape[1])
+    assert np.array_equal(np.asarray(x), every)
+    assert np.array_equal(np.array(list(x)), every)
+    rng, n = np.random.default_rng(1), len(x)
+    for k in (0, -1, n - 1, -n, *rng.integers(0, n, 30).tolist(), np.int64(7)):
+        assert np.array_equal(x[k], every[k])
+        assert np.array_equal(x[k, [2, 1]], every[k, [2, 1]])
+    rows = rng.integers(-n, n, 500)
+    mask = rng.random(n) < 0.01
+    for key in (slice(None), slice(5, None, 97), slice(-9, None, -1), rows, mask):
+        assert np.array_equal(x[key], every[key])
+        assert np.array_equal(x[key, 1:4], every[key, 1:4])
+    assert x[3:3].shape == (0, x.shape[1])
+    for k in (n, -n - 1):
+        with pytest.raises(IndexError):
+            x[k]
+
+
+def test_a_planned_trajectory_holds_no_samples(demo_plan):
+    """Twice the samples, no more memory: only the last block of them is kept."""
+    t = demo_plan.trajectory
+    longest = np.diff(t.keyframes).max() * RATE
+    for x in (t.q, t.v, t.tau):
+        assert isinstance(x, Samples)
+        for k in range(0, len(x), 500):
+            x[k]
+        assert x._block.shape[0] <= longest < len(x) / 3
 
 
 def test_no_moment_is_left_about_the_zero_moment_point(rng):
