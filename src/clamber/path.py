@@ -366,7 +366,7 @@ def check_phases(
     ends the transition has looked at, and while weight shifts more contacts bear.
     """
     kin, world = ik.kin, ik.world
-    worst, note = 0.0, ""
+    worst, weak, note = 0.0, False, ""
     moving = (*t.leaving, t.move.makes) if t.move.makes else t.leaving
     for phase in phases:
         watched = watched_pairs(world, (*phase.contacts, *moving))
@@ -382,6 +382,8 @@ def check_phases(
                 if drift > DRIFT_LIMIT:
                     where = f"{1e3 * drift:.0f} mm ({phase.kind})"
                     return Status.UNREACHABLE, f"a contact opens by {where}"
-            if phase.kind == "swing" and not holds(kin, phase.contacts):
-                return Status.OVERLOADED, ""
-    return (Status.COLLIDING if worst > OVERLAP_LIMIT else Status.SOLVED), note
+            if phase.kind == "swing":
+                weak = weak or not holds(kin, phase.load_after)
+    if worst > OVERLAP_LIMIT:
+        return Status.COLLIDING, note
+    return (Status.OVERLOADED, "") if weak else (Status.SOLVED, note)
