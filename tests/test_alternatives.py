@@ -27,7 +27,7 @@ from clamber.disturbance import Disturbance
 from clamber.errors import InputError
 from clamber.exploration import Bounds, Explored, Stop
 from clamber.io import load_plan, load_state, save_plan, save_sequence
-from clamber.model import Kinematics, build_world
+from clamber.model import Kinematics, build_world, load_robot
 from clamber.moves import Skipped, split_moves
 from clamber.scene import Scene
 from clamber.simulation import judge, simulate
@@ -377,6 +377,20 @@ def test_the_search_goes_on_from_where_the_farthest_alternative_is_stuck(
     farthest, anew = begun
     assert [s.move.limb for s in farthest] == ["left_arm", "right_arm", "left_leg"]
     assert anew == []
+
+
+@pytest.mark.slow
+def test_weak_wrists_leave_the_weight_to_the_elbows(demo_sequence):
+    robot = load_robot("coman29")
+    scene = Scene.from_height(0.275)
+    hands = on_hands(demo_sequence)
+    assert plan_or_replan(hands, robot, scene).instead == ""
+    world = build_world(robot, scene)
+    efforts = zip(world.joints, world.tau_max, strict=True)
+    weak = {name: 1.0 for name, effort in efforts if effort <= 5.0}
+    found = plan_or_replan(hands, replace(robot, effort=weak), scene)
+    assert found.complete
+    assert found.instead.endswith("of the alternatives: LElbow, RElbow")
 
 
 @pytest.mark.slow
