@@ -363,7 +363,11 @@ def test_what_is_sampled_when_asked_for_is_indexed_as_an_array_is(demo_plan, nam
     for key in (slice(None), slice(5, None, 97), slice(-9, None, -1), rows, mask):
         assert np.array_equal(x[key], every[key])
         assert np.array_equal(x[key, 1:4], every[key, 1:4])
+    for key in (np.ix_(rows, [2, 1]), (rows[:3], [3, 0, 2]), (rows[:9, None], 1)):
+        assert np.array_equal(x[key], every[key])
     assert x[3:3].shape == (0, x.shape[1])
+    with pytest.raises(IndexError):
+        x[[0, n]]
     for k in (n, -n - 1):
         with pytest.raises(IndexError):
             x[k]

@@ -89,17 +89,23 @@ class Samples:
             out = block[k - start]
             return out[columns[0]] if columns else out
         if isinstance(rows, slice):
-            index = np.arange(*rows.indices(len(self)))
-        else:
-            index = np.asarray(rows)
-            index = np.flatnonzero(index) if index.dtype == bool else index % len(self)
-        out = np.empty((len(index), self.shape[1]))
-        number = np.searchsorted(self._ends, index, side="right")
+            some = self._gather(np.arange(*rows.indices(len(self))))
+            return some[(slice(None), *columns)]
+        index = np.asarray(rows)
+        index = np.flatnonzero(index) if index.dtype == bool else index
+        if index.size and not -len(self) <= index.min() <= index.max() < len(self):
+            raise IndexError(f"rows {index.min()} to {index.max()} of {len(self)}")
+        some = self._gather(index.ravel() % len(self))
+        return some[(np.arange(index.size).reshape(index.shape), *columns)]
+
+    def _gather(self, rows: np.ndarray) -> np.ndarray:
+        out = np.empty((len(rows), self.shape[1]))
+        number = np.searchsorted(self._ends, rows, side="right")
         for i in np.unique(number):
             mine = number == i
             start, block = self._look(i)
-            out[mine] = block[index[mine] - start]
-        return out[:, columns[0]] if columns else out
+            out[mine] = block[rows[mine] - start]
+        return out
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Row after row."""
