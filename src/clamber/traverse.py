@@ -4,7 +4,7 @@ Algorithm 3 of the thesis: the policy's cycles are run from the initial state un
 goal; contacts start at the obstacle's closest points and go on by a third of what the
 limb reaches, towards the goal; each of them is planned by the ordinary search. What
 comes next is read off the stance alone, so that a plan can go on from any stance, as it
-is felt.
+is felt. Stairs are climbed on hands and feet (`stairs`), the last riser on knees.
 
 The way down is a way up: a climb that is statically stable is so backwards as well. The
 ascent is planned from where the robot will stand behind the far edge; each of its
