@@ -241,6 +241,8 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     s = SimpleNamespace(
         calls=[], plan=plan, verdict=verdict, options=None, no_opengl=False, timings={}
     )
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
 
     def note(name: str, result: object = None) -> None:
         def stage(*args: object, **options: object) -> object:
@@ -248,7 +250,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
             if name == "plan":
                 s.options = options["options"]
                 options["progress"]("plan", 0.0, "air -> LHand on table")
-                time.sleep(0.03)
+                now[0] += 0.03
                 options["progress"]("trajectory", 1.0, "")
             if name == "render_run":
                 s.drawing = options
@@ -332,8 +334,8 @@ def test_each_move_has_its_row_with_figures_and_seconds(
     first, second = json.loads(capsys.readouterr().out)["keyframes"]
     assert first["move"] == "start"
     assert second["projected_distance"] == {"LHand": 0.0425}
-    assert second["seconds"] == pytest.approx(0.03, abs=0.02)
-    assert stages.timings["plan"] == pytest.approx(0.03, abs=0.02)
+    assert second["seconds"] == pytest.approx(0.03)
+    assert stages.timings["plan"] == pytest.approx(0.03)
 
 
 def test_the_clock_adds_up_what_was_tried_again(monkeypatch: pytest.MonkeyPatch):
