@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -382,6 +383,14 @@ def test_a_planned_trajectory_holds_no_samples(demo_plan):
         for k in range(0, len(x), 500):
             x[k]
         assert len(x._held[1]) <= longest < len(x) / 3
+
+
+def test_a_planned_trajectory_is_pickled_as_arrays(demo_plan):
+    t = demo_plan.trajectory
+    again = pickle.loads(pickle.dumps(t))
+    for name in ("q", "v", "tau"):
+        assert isinstance(getattr(again, name), np.ndarray)
+        assert np.array_equal(getattr(again, name), np.asarray(getattr(t, name)))
 
 
 def test_no_moment_is_left_about_the_zero_moment_point(rng):

@@ -118,6 +118,10 @@ class Samples:
         """All rows."""
         return np.array(self[:], dtype=dtype)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as the array of all rows."""
+        return np.asarray, (self[:],)
+
     def blocks(self) -> Iterator[np.ndarray]:
         """(m, n) the rows of one block after the other."""
         for i in range(len(self._ends)):
