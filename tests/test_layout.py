@@ -50,6 +50,7 @@ LAYERS = [
     "checkup",
     "route",
     "stairs",
+    "build",
     "traverse",
     "control",
     "terrain",

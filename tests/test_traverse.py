@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from clamber import traverse as module
+from clamber.build import build_of
 from clamber.contact import Contact
 from clamber.errors import InputError
 from clamber.io import load_plan, save_plan
@@ -184,8 +185,8 @@ def test_the_posture_on_all_fours_rests_on_them_level(task):
 
 def test_steps_are_a_third_of_a_limb_or_what_was_shown(robot):
     ik = IK(build_world(robot, scene()))
-    far = module._build(ik, replace(POLICY, reach={"LElbow": 5.0}))
-    near = module._build(ik, replace(POLICY, reach={"LElbow": 0.1}))
+    far = build_of(ik, replace(POLICY, reach={"LElbow": 5.0}))
+    near = build_of(ik, replace(POLICY, reach={"LElbow": 0.1}))
     assert near.step["left_arm"] == pytest.approx(0.3 * far.step["left_arm"])
     assert near.step["right_arm"] == far.step["right_arm"]
 
@@ -372,7 +373,7 @@ def test_contacts_that_come_back_to_where_they_were_end_the_plan(task, monkeypat
         return [(other, "path", "ac3")], ""
 
     monkeypatch.setattr(module, "_manoeuvre", manoeuvre)
-    found = module._follow(task, keys["back"], 100, lambda *a: None)
+    found = module._follow((task,), keys["back"], 100, lambda *a: None)
     assert not found.arrived
     assert "to and fro" in found.missed
     assert len(found.paths) == 3  # ahead, back, and ahead again
@@ -519,9 +520,10 @@ def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step(
 
     def manoeuvre(task, key):
         asked.append(task.policy)
+        on = SimpleNamespace(stance=(contact("LKnee", 0.1 * len(asked), 0.0),))
         if task.policy is policy:
-            return ([(key, None, "ac3")], "") if len(asked) == 1 else ([], "stuck")
-        return ([(key, None, "ac1")], "") if len(asked) < 5 else ([], "stuck too")
+            return ([(on, None, "ac3")], "") if len(asked) == 1 else ([], "stuck")
+        return ([(on, None, "ac1")], "") if len(asked) < 5 else ([], "stuck too")
 
     monkeypatch.setattr(module, "_manoeuvre", manoeuvre)
     found = follow_policy(ik, policy, key, PlanOptions(), changes=9)

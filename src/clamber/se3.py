@@ -72,6 +72,12 @@ def quat_conjugate(q: ArrayLike) -> np.ndarray:
     return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
+def turn_about_z(yaw: float) -> np.ndarray:
+    """Rotation (2, 2) of the plane by a yaw [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s], [s, c]])
+
+
 def rotation_vector(R: np.ndarray) -> np.ndarray:
     """Rotation vector (3,) of a rotation matrix (3, 3) [rad]."""
     quat, out = np.empty(4), np.empty(3)

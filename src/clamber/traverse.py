@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clamber.build import DEPTH, STAND, Build, build_of
 from clamber.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError
 from clamber.model import Robot, World, build_world
@@ -57,11 +58,10 @@ from clamber.route import (
     room_on,
 )
 from clamber.scene import GROUND, Scene
-from clamber.se3 import matrix_from_quat, quat_from_matrix
+from clamber.se3 import matrix_from_quat, quat_from_matrix, turn_about_z
 from clamber.search import home_at, plan_step, standing
-from clamber.stairs import FLUSH, Gait, is_flight, next_contacts
+from clamber.stairs import FLUSH, is_flight, next_contacts
 
-STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
 TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
 CYCLES = (1.0, 0.5, 0.25)  # a cycle over a riser that fails is tried shorter
@@ -74,13 +74,8 @@ FACING = 0.15  # [rad] from how it shall face
 # Cycles in a row that bring the goal nearer by less than the second [m] are given up:
 # to turn around on the spot takes 13.
 PATIENCE, NEARER_BY = 20, 0.01
-# Where the body stands before an edge, in lengths of its legs, and what may differ.
-STAND, STAND_TOL = 0.54, 0.12
+STAND_TOL = 0.12  # lengths of a leg, from where the body stands before an edge
 BESIDE_TOL = 0.10  # [m] along the edge
-REACH = 0.65  # lengths of an arm that hands reach beyond a stand
-# Contacts while climbing, from the edge inwards: in steps of the limb.
-DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
-STRETCH = 0.57  # lengths of the trunk from the body's middle to hands or knees
 LEAN = np.radians(80.0)  # of the trunk on all fours
 # Knees stay so far from a riser, in lengths of a thigh: nearer to it, the thigh meets
 # its upper edge before it leans far enough for the weight to get past the other knee.
@@ -118,41 +113,10 @@ class _Frame:
     yaw: float
 
     def at(self, offset: np.ndarray) -> np.ndarray:
-        return self.xy + _turn(self.yaw) @ offset
+        return self.xy + turn_about_z(self.yaw) @ offset
 
     def local(self, p: np.ndarray) -> np.ndarray:
-        return _turn(self.yaw).T @ (p[:2] - self.xy)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Build:
-    """What a robot's build says of its steps.
-
-    Attributes:
-        step: Of each limb (5.9) [m].
-        fours: (2,) offset of each limb's contact from the body's frame, on all fours.
-        feet: Half the distance between the feet.
-        ahead: (2,) from the ankles' midpoint to the feet's, in the body's frame.
-        stand: From the feet to an edge that is to be climbed [m].
-        reach: From the feet to an edge, at most [m].
-        tall: Height that hands reach, standing [m].
-        thigh: [m]
-        stretch: Half of what it is stretched by on hands and knees [m].
-        round: Radius of what the body takes up while it turns on all fours [m].
-        gait: On stairs.
-    """
-
-    step: dict[str, float]
-    fours: dict[str, np.ndarray]
-    feet: float
-    ahead: np.ndarray
-    stand: float
-    reach: float
-    tall: float
-    thigh: float
-    stretch: float
-    round: float
-    gait: Gait
+        return turn_about_z(self.yaw).T @ (p[:2] - self.xy)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -165,7 +129,7 @@ class _Task:
     platforms: tuple[Platform, ...]
     goal: np.ndarray
     goal_yaw: float | None
-    build: _Build
+    build: Build
     fours: np.ndarray
 
 
@@ -400,7 +364,7 @@ def _walk(
     legs = [x for x in task.ik.world.robot.limbs.values() if not x.is_arm]
     step = min(task.build.step[x.name] for x in legs)
     body = _between(frame, wanted, step, STEP_TURN)
-    side = _turn(frame.yaw).T @ (body.xy - frame.xy)
+    side = turn_about_z(frame.yaw).T @ (body.xy - frame.xy)
     turn = _apart(frame.yaw, body.yaw)
     left_first = side[1] + task.build.feet * turn > 0
     legs.sort(key=lambda x: x.name.startswith("left") != left_first)
@@ -899,7 +863,7 @@ def _brought_back(
     for nearer in NEARER:
         out, now = list(made), key
         offset = (1.0 - nearer) * task.build.fours[limb]
-        around = _Frame(here - _turn(body.yaw) @ offset, body.yaw)
+        around = _Frame(here - turn_about_z(body.yaw) @ offset, body.yaw)
         for group in groups:
             _cycle(task, now, platform, option, around, group, out, back=True)
             now = out[-1][0]
@@ -1162,7 +1126,7 @@ def _leading_first(
 
     Where elbows follow knees and step first, what bears the robot shrinks.
     """
-    way = _turn(frame.yaw).T @ (full.xy - frame.xy)
+    way = turn_about_z(frame.yaw).T @ (full.xy - frame.xy)
     arms_lead = way[0] > -1e-6
     robot = task.ik.world.robot
     leads = [robot.limb_of(s).is_arm == arms_lead for s in option.surfaces]
@@ -1250,7 +1214,7 @@ def _pelvis(task: _Task, key: Keyframe, body: _Frame) -> np.ndarray | None:
 
 def _contact(world: World, surface: str, place: Place, yaw: float) -> Contact:
     R = np.eye(3)
-    R[:2, :2] = _turn(yaw)
+    R[:2, :2] = turn_about_z(yaw)
     return Contact(
         surface=surface,
         support=place.support,
@@ -1283,11 +1247,6 @@ def _apart(a: float, b: float) -> float:
     return math.remainder(b - a, 2.0 * math.pi)
 
 
-def _turn(yaw: float) -> np.ndarray:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s], [s, c]])
-
-
 # The robot's build, and what cannot be.
 
 
@@ -1301,7 +1260,7 @@ def _task(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> _Task:
     scene = ik.world.scene
     goal = goal_of(scene)
     yaw = scene.goal
-    build = _build(ik, policy)
+    build = build_of(ik, policy)
     return _Task(
         ik=ik,
         policy=policy,
@@ -1314,7 +1273,7 @@ def _task(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> _Task:
     )
 
 
-def _posture_on_fours(ik: IK, policy: GeneralPolicy, build: _Build) -> np.ndarray:
+def _posture_on_fours(ik: IK, policy: GeneralPolicy, build: Build) -> np.ndarray:
     """(nq,) the robot on elbows and knees, held as the policy holds its pelvis.
 
     What steps on all fours stay near to, so that twists do not add up.
@@ -1346,75 +1305,6 @@ def _own_clearance(world: World) -> np.ndarray:
     """(P,) the robot keeps off itself; the scene does not count."""
     own = (world.model.geom_bodyid[world.pairs] > 0).all(axis=1)
     return np.where(own, CLEARANCE, -np.inf)
-
-
-def _build(ik: IK, policy: GeneralPolicy) -> _Build:
-    world, kin = ik.world, ik.kin
-    kin.update(world.home)
-    along = _turn(world.scene.start[2])
-    limbs = world.robot.limbs.values()
-    root = {x.name: along.T @ kin.landmark(x.root)[1][:2] for x in limbs}
-    arms = [x for x in limbs if x.is_arm]
-    legs = [x for x in limbs if not x.is_arm]
-    length = {
-        x.name: sum(
-            float(np.linalg.norm(kin.landmark(a)[1] - kin.landmark(b)[1]))
-            for a, b in ((x.root, x.middle), (x.middle, x.end))
-        )
-        for x in limbs
-    }
-    trunk = float(
-        np.linalg.norm(kin.landmark(arms[0].root)[1] - kin.landmark(legs[0].root)[1])
-    )
-    step = {}
-    for x in limbs:
-        shown = [policy.reach[s] for s in x.surfaces if s in policy.reach]
-        step[x.name] = min(1.0 / STEPS, max(shown, default=1.0)) * length[x.name]
-    half = {
-        kind: 0.5 * abs(float(root[a.name][1] - root[b.name][1]))
-        for kind, (a, b) in (("arm", arms), ("leg", legs))
-    }
-    fours = {}
-    for x in limbs:
-        sign = 1.0 if x.name.startswith("left") else -1.0
-        side = 1.1 * half["arm"] if x.is_arm else 1.35 * half["leg"]
-        ahead = 0.35 * trunk if x.is_arm else -0.35 * trunk
-        fours[x.name] = np.array([ahead, sign * side])
-    up = np.array([0.0, 0.0, 1.0])
-    soles = [kin.contact_point(x.surfaces[0], up)[:2] for x in legs]
-    leg, arm = length[legs[0].name], length[arms[0].name]
-    thigh = float(
-        np.linalg.norm(kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1])
-    )
-    feet = 0.5 * float(np.linalg.norm(soles[0] - soles[1]))
-    ahead = along.T @ (np.mean(soles, axis=0) - world.scene.start[:2])
-    stand, arm_step = STAND * leg, min(step[x.name] for x in arms)
-    sides = {}
-    for x in limbs:
-        y = fours[x.name][1]
-        sides |= dict.fromkeys(x.surfaces, float(y))
-        if not x.is_arm:
-            sides[x.surfaces[0]] = math.copysign(feet, y)
-    return _Build(
-        step=step,
-        fours=fours,
-        feet=feet,
-        ahead=ahead,
-        stand=stand,
-        reach=stand + REACH * arm,
-        tall=leg + trunk + arm,
-        thigh=thigh,
-        stretch=STRETCH * trunk,
-        # The shanks trail behind the knees.
-        round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
-        gait=Gait(
-            lead=stand + DEPTH["hand"] * arm_step,
-            gap=arm_step,
-            knee=DEPTH["knee"] * min(step[x.name] for x in legs),
-            span=float(fours[arms[0].name][0] - fours[legs[0].name][0]),
-            sides=sides,
-        ),
-    )
 
 
 def _check_route(task: _Task) -> None:
