@@ -174,6 +174,15 @@ def test_where_there_is_no_way_down_contacts_move_to_where_there_is(task, monkey
         refused.append("LKnee")
 
 
+def test_the_last_step_of_a_descent_rises(task):
+    """A robot that stays bent has its weight near its toes, and tips over them."""
+    _, rows = module._descent(task, task.platforms[0])
+    assert [step.rises for step, _ in rows] == [False] * (len(rows) - 1) + [True]
+    last = rows[-1][0].move
+    assert last.makes is None
+    assert task.ik.world.robot.limb_of(last.breaks[0]).is_arm
+
+
 def test_the_posture_on_all_fours_rests_on_them_level(task):
     world = task.ik.world
     kin = Kinematics(world)

@@ -313,8 +313,8 @@ def _plan_on(
     )
     begin = before.q
     if step.rises:
-        task = replace(task, q_reference=world.home, directions={})
         begin = _home_over(world, (*held, *new))
+        task = replace(task, q_reference=begin, directions={})
     wanted, result = move.makes, "nothing tried"
     for there in (True, False) if move.firm else (False, True):
         if wanted is not None and there:

@@ -612,6 +612,7 @@ def _descent(
                     move=move,
                     guide=guide,
                     reference=reference,
+                    rises=path is found.paths[0],
                 ),
                 name,
             )
