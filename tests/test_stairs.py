@@ -332,7 +332,7 @@ def test_the_upright_posture_closes_its_contacts(climbing):
     key = keys[4]
     here = next(c for c in key.stance if c.surface == "LHand")
     place = Place(support="s2", position=here.position + np.array([0.04, 0, 0]))
-    q = traverse._upright(task, key, here, "LHand", place)
+    q = traverse._upright(task, key, "LHand", place)
     kin = task.ik.kin
     kin.update(q)
     up = np.array([0.0, 0.0, 1.0])
@@ -355,7 +355,7 @@ def test_a_pair_that_does_not_fit_goes_to_its_next_places(climbing, monkeypatch)
     def wanted(*_):
         return [("LFoot", (far, near)), ("RFoot", (far, near))]
 
-    def attempt(task, key, surface, here, place, *_, **__):
+    def attempt(task, key, surface, place, *_, **__):
         asked.append((surface, float(place.position[0])))
         if surface == "RFoot" and place is far:
             return "too far"

@@ -27,7 +27,7 @@ from clamber.path import Phase
 from clamber.posture.keyframe import bearing_frames, torque_limits
 from clamber.retiming import GRID, demand_at, least_torques, retime
 from clamber.se3 import quat_conjugate, quat_multiply
-from clamber.statics import com_margins, contact_forces, support_polygon
+from clamber.statics import GRAVITY, com_margins, contact_forces, support_polygon
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
@@ -41,7 +41,6 @@ INERTIA_SHARE = 0.6  # of the balance margin that inertia may use up
 BALANCE_SAMPLES = 24  # of the centre of mass along a phase
 BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
 SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
-GRAVITY = 9.81  # [m/s^2]
 LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
 TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
@@ -116,11 +115,11 @@ class Samples:
         self, dtype: np.dtype | None = None, copy: bool | None = None
     ) -> np.ndarray:
         """All rows."""
-        return np.array(self[:], dtype=dtype)
+        return np.concatenate(list(self.blocks())).astype(dtype, copy=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled as the array of all rows."""
-        return np.asarray, (self[:],)
+        return np.asarray, (np.asarray(self),)
 
     def blocks(self) -> Iterator[np.ndarray]:
         """(m, n) the rows of one block after the other."""

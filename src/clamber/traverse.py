@@ -60,7 +60,7 @@ from clamber.route import (
 from clamber.scene import GROUND, Scene
 from clamber.se3 import matrix_from_quat, quat_from_matrix, turn_about_z
 from clamber.search import home_at, plan_step, standing
-from clamber.stairs import FLUSH, is_flight, next_contacts
+from clamber.stairs import CLEAR, FLUSH, is_flight, next_contacts
 
 TURN = 0.25  # [rad] of the body in one cycle on all fours
 STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
@@ -81,7 +81,6 @@ LEAN = np.radians(80.0)  # of the trunk on all fours
 # its upper edge before it leans far enough for the weight to get past the other knee.
 BEFORE_RISER = 0.5
 OVER_MIDDLE = 3.0  # weight of the centre of mass between hands and feet
-CLEAR = 0.02  # [m] between a surface and what is higher than its support
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -373,11 +372,8 @@ def _walk(
     for leg in legs:
         sign = 1.0 if leg.name.startswith("left") else -1.0
         target = body.at(np.array([0.0, sign * task.build.feet]))
-        now = next((c for c in key.stance if c.surface in leg.surfaces), None)
         place = Place(support=GROUND, position=np.array([*target, 0.0]))
-        found = _attempt(
-            task, key, leg.surfaces[0], now, place, body, _home(task, body)
-        )
+        found = _attempt(task, key, leg.surfaces[0], place, body, _home(task, body))
         if isinstance(found, str):
             why = found
             continue
@@ -439,21 +435,18 @@ def _set_all(
 ) -> tuple[list[_Made], str]:
     """Surfaces set down at their places; why not the last of those that are not."""
     body = _Frame(platform.entry.point, platform.entry.yaw)
-    limb_of = task.ik.world.robot.limb_of
     made: list[_Made] = []
     why = ""
     for _ in range(2):  # what cannot move yet is tried again once the others have
         left, why = [], ""
         for surface, place in wanted:
-            here = _by_limb(task, key.stance).get(limb_of(surface).name)
             found = _attempt(
                 task,
                 key,
                 surface,
-                here,
                 place,
                 body,
-                _upright(task, key, here, surface, place),
+                _upright(task, key, surface, place),
                 shares=SHRUNK[:1],
                 imposed=False,
             )
@@ -467,9 +460,7 @@ def _set_all(
     return made, why
 
 
-def _upright(
-    task: _Task, key: Keyframe, here: Contact | None, surface: str, place: Place
-) -> np.ndarray:
+def _upright(task: _Task, key: Keyframe, surface: str, place: Place) -> np.ndarray:
     """(nq,) with a surface at its place, the weight between the hands and the feet.
 
     What the postures on stairs stay near to: legs that come after the hands otherwise
@@ -477,7 +468,8 @@ def _upright(
     """
     world = task.ik.world
     new = _contact(world, surface, place, task.platforms[0].entry.yaw)
-    stance = [c for c in key.stance if here is None or c.surface != here.surface]
+    limb = world.robot.limb_of(surface)
+    stance = [c for c in key.stance if c.surface not in limb.surfaces]
     stance.append(new)
     where = {c.surface: c.support for c in stance}
     problem = PostureProblem(
@@ -662,7 +654,7 @@ def _rearranged(task: _Task, key: Keyframe, top: tuple[Contact, ...]) -> list[_M
         if here is not None and np.linalg.norm(c.position - here.position) < SAME:
             continue
         place = Place(support=c.support, position=c.position)
-        found = _attempt(task, key, c.surface, here, place, body, task.fours)
+        found = _attempt(task, key, c.surface, place, body, task.fours)
         if not isinstance(found, str):
             key, path = found
             made.append((key, path, option.name))
@@ -712,7 +704,7 @@ def _set_down(
         now = task.ik.kin.contact_point(surface, np.array([0.0, 0.0, 1.0]))
         for wanted in (frame.at(task.build.fours[limb]), now[:2]):
             place = _place(task, platform, surface, wanted, platform.boxes)
-            found = _attempt(task, key, surface, None, place, frame, task.fours)
+            found = _attempt(task, key, surface, place, frame, task.fours)
             if not isinstance(found, str):
                 key, path = found
                 made.append((key, path, option.name))
@@ -1030,11 +1022,7 @@ def _make(
     """Add to `made`, which begins at `key`, a contact by the first surface that can."""
     key = made[-1][0] if made else key
     for surface in surfaces:
-        limb = task.ik.world.robot.limb_of(surface).name
-        here = _by_limb(task, key.stance).get(limb)
-        found = _attempt(
-            task, key, surface, here, place, body, task.fours, imposed=False
-        )
+        found = _attempt(task, key, surface, place, body, task.fours, imposed=False)
         if not isinstance(found, str):
             made.append((*found, option.name))
             return
@@ -1104,7 +1092,6 @@ def _cycle(
             task,
             key,
             surface,
-            here,
             place,
             body,
             task.fours,
@@ -1142,7 +1129,6 @@ def _attempt(
     task: _Task,
     key: Keyframe,
     surface: str,
-    here: Contact | None,
     place: Place,
     body: _Frame,
     reference: np.ndarray | None,
@@ -1152,10 +1138,11 @@ def _attempt(
 ) -> tuple[Keyframe, Path] | str:
     """Move one contact to a place, or part of the way there; or why not.
 
-    A limb without a contact `here` is set down there.
+    A limb without a contact is set down there.
     """
     world = task.ik.world
     limb = world.robot.limb_of(surface)
+    here = _by_limb(task, key.stance).get(limb.name)
     why = ""
     for share in shares:
         position = place.position

@@ -47,6 +47,7 @@ from clamber.posture.keyframe import STABILITY_WEIGHT, Keyframe
 from clamber.scene import GROUND, Scene, Support
 from clamber.simulation import Rollout
 from clamber.statics import com_margin, projected_distance, support_polygon, theta_max
+from clamber.trajectory import Samples
 
 Preset = Literal["corner", "side", "front", "behind", "top"]
 FROM_ABOVE = -70.0  # [deg] elevation from which the camera's light whitens the ground
@@ -589,13 +590,9 @@ def climb_sheet(
     return _save_sheet(tiles, path, columns=4, colours=200)
 
 
-def _some(x: np.ndarray, n: int) -> np.ndarray:
+def _some(x: np.ndarray | Samples, n: int) -> np.ndarray:
     """About `n` rows, evenly spaced, the last one among them."""
-    return x[_evenly(len(x), n)]
-
-
-def _evenly(length: int, n: int) -> np.ndarray:
-    return np.unique(np.linspace(0, length - 1, min(n, length)).round().astype(int))
+    return x[np.unique(np.linspace(0, len(x) - 1, min(n, len(x))).round().astype(int))]
 
 
 @functools.cache
@@ -1133,8 +1130,7 @@ def render_frame(
     path = folder / f"frame-{time:g}.png" if out is None else Path(out)
     if path.suffix != ".png":
         raise InputError("a name that ends in .png", source=path)
-    some = q[_evenly(len(q), 60)]
-    view = view_of(world, some, size[0] / size[1], camera)
+    view = view_of(world, _some(q, 60), size[0] / size[1], camera)
     with Camera(world, size, cutout=transparent) as drawing:
         draw = drawing.cutout if transparent else drawing.shot
         picture = draw(q[row], view)
