@@ -6,7 +6,8 @@ along the normal until it does, or until `REACH` is used up. Where a contact is 
 where it was planned, the supports are estimated anew from all contacts felt so far, the
 stance is taken as it is, and the remaining keyframes are solved again from there while
 the robot stands still. A contact that bears nothing at the end of a step is felt for
-again. Where nothing is found, the robot stays in the stance it is in and says why.
+again. Where nothing is found, the others bear the robot and another place is planned
+for the limb; where there is none, the robot stays in the stance it is in and says why.
 
 What is sensed is `Measurement`: joint encoders, base pose, contact force of each
 surface; late and noisy. Nothing else of the physics is looked at.
@@ -62,6 +63,7 @@ SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for what leans
 LEAN_STRIDE = 10  # physics steps between two looks at that
 KEPT_OFF = 0.02  # [m] farther than where it leant
 WITHDRAWALS = 4  # as often another way is looked for
+SEARCHES = 4  # as often another place is looked for, where a contact is not found
 
 Ticks = Iterator[None]
 
@@ -155,6 +157,7 @@ class Execution:
         # What leans without there being another way.
         self._stays: set[tuple[int, str]] = set()
         self._withdrawals = 0
+        self._searches = 0
         self._scale = 1.0  # of the torques: mass as felt over mass as described
         self._pose = plan.trajectory.q[0].copy()
         self._load = np.zeros((len(self._surfaces), 3))
@@ -246,10 +249,7 @@ class Execution:
             if not self._touches(c):
                 felt = yield from self._feel(c)
                 if felt is None:
-                    self._stop(
-                        f"{c.surface} finds no support within {1e3 * REACH:.0f} mm"
-                        " of where it was planned"
-                    )
+                    yield from self._seek(c)
                     return
                 if felt is not c or abs(self._off(c)[0]) > DEVIATION:
                     yield from self._take(felt)
@@ -316,6 +316,22 @@ class Execution:
         self._leg += 1
         self._tick_off(leg)
         yield from self._replan((*stance, made), stance)
+
+    def _seek(self, c: Contact) -> Ticks:
+        """A contact is not found where it was planned: another place for the limb."""
+        missing = (
+            f"{c.surface} finds no support within {1e3 * REACH:.0f} mm of where it was"
+            " planned"
+        )
+        if self._searches == SEARCHES:
+            self._stop(missing)
+            return
+        self._searches += 1
+        self._note(missing)
+        limb = self._plan.world.robot.limb_of(c.surface)
+        stance = self._keyframes[self._leg].stance
+        held = [x for x in stance if x.surface not in limb.surfaces]
+        yield from self._replan(held, held)
 
     def _check_start(self) -> Ticks:
         """Is the robot where it should be, and as heavy?"""
@@ -460,6 +476,11 @@ class Execution:
             if felt is not None:
                 self._velocity = np.zeros(len(self._dadr))
                 return felt
+        for i in reversed(range(0 if t is None else len(t.time))):
+            assert t is not None
+            self._set(t, i)
+            self._velocity = -self._velocity
+            yield
         return None
 
     def _replan(self, contacts: Sequence[Contact], loaded: Sequence[Contact]) -> Ticks:
