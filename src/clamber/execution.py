@@ -30,6 +30,7 @@ from clamber.adaptation import (
     go_on,
     start_again,
 )
+from clamber.balance import Balance
 from clamber.contact import Contact
 from clamber.control import JointLaw
 from clamber.leaning import Lean, is_leaning, leaning_part, strikes, striking_part
@@ -46,6 +47,7 @@ TOUCH = 10.0  # [N] normal force that is a contact
 LOST = 1.5  # [N] a contact of the stance that bears less is lost
 FORCE_SMOOTHING = 0.03  # [s] time constant of the forces
 POSE_SMOOTHING = 0.01  # [s] ... and of the measured posture: it must not lag a touch
+TILTED = 0.35  # [rad] a sole that is more so touches with a corner
 NEAR = 0.06  # [m] sideways from the planned place, a touch is that contact
 DEVIATION = 0.006  # [m] along the normal: the rest is planned again
 DRIFT = 0.015  # [m] along the support: the rest is planned again
@@ -60,7 +62,7 @@ FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SAME_PLACE = 0.05  # [m] a surface that is felt again this near replaces what was felt
 LEANING = 0.1  # [s] a part bears for so long where it should not: it leans
 SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for what leans
-LEAN_STRIDE = 10  # physics steps between two looks at that
+LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
 KEPT_OFF = 0.02  # [m] farther than where it leant
 WITHDRAWALS = 4  # as often another way is looked for
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
@@ -171,6 +173,7 @@ class Execution:
         self.rests_on: tuple[str, ...] = ()
         self._adopt(plan.world, plan.trajectory, plan.keyframes, "", more=False)
         self._set(plan.trajectory, 0)
+        self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
         self._behaviour = self._behave()
 
     def command(self, measured: Measurement) -> np.ndarray:
@@ -180,9 +183,10 @@ class Execution:
         self._k += 1
         v = np.zeros(self._nv)
         v[self._dadr] = self._velocity
-        self._rows.append((self.reference, v, self._torque, self._closed))
+        reference = self._balanced()
+        self._rows.append((reference, v, self._torque, self._closed))
         return self._law.command(
-            self.reference[self._qadr],
+            reference[self._qadr],
             self._velocity,
             self._scale * self._torque,
             measured.q[self._qadr],
@@ -572,11 +576,31 @@ class Execution:
             q[3:7] *= -1
         q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
         q[3:7] /= math.sqrt(q[3:7] @ q[3:7])
-        if self._slow and self._k % LEAN_STRIDE == 0:
+        if self._slow and self._k % LOOK_STRIDE == 0:
             if is_leaning(self._load, self._weight) or self._struck():
-                self._leaning += LEAN_STRIDE * PHYSICS_STEP
+                self._leaning += LOOK_STRIDE * PHYSICS_STEP
             else:
                 self._leaning = 0.0
+
+    def _balanced(self) -> np.ndarray:
+        """(nq,) the reference, its centre of mass moved where balance asks for it."""
+        if not self._slow:  # in faster motion the robot need not balance statically
+            return self.reference
+        if self._k % LOOK_STRIDE == 0:
+            self._balance.feel(self._pose, self.reference, self._bearing())
+        q = self.reference.copy()
+        q[self._qadr] += self._balance.offset(PHYSICS_STEP)
+        return q
+
+    def _bearing(self) -> list[Contact]:
+        """Contacts that are closed by the plan and bear load."""
+        near = self._keyframes[self._leg : self._leg + 2]
+        contacts = {c.surface: c for key in near for c in key.stance}
+        return [
+            c
+            for c in contacts.values()
+            if self._closed[self._surfaces.index(c.surface)] and self._force(c) >= LOST
+        ]
 
     def _struck(self) -> list[str]:
         """Surfaces, neither in contact nor about to be, that strike a side."""
@@ -640,9 +664,21 @@ class Execution:
             other = replace(c, surface=surface, edge=None, link=None)
             if surface != c.surface and self._force(other) >= TOUCH:
                 p = self._point(other)
-                if support.inside(p) and abs(support.height(p)) < REACH:
+                there = support.inside(p) and abs(support.height(p)) < REACH
+                if there and self._lies(surface, support.normal):
                     return replace(other, position=p)
         return None
+
+    def _lies(self, surface: str, normal: np.ndarray) -> bool:
+        """Whether a surface lies on a support rather than touching with a corner.
+
+        Only then its middle is where the support is. The kinematics are up to date.
+        """
+        s = self._world.surfaces[surface]
+        if s.rotation is None:
+            return True
+        up = (self._kin.rotation(s.body) @ s.rotation)[:, 2]
+        return float(up @ normal) > math.cos(TILTED)
 
     def _point(self, c: Contact) -> np.ndarray:
         """(3,) where the surface's lowest point is by the sensors."""
