@@ -401,11 +401,6 @@ def test_a_box_too_high_for_the_demonstration_has_an_alternative(demo_sequence, 
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="tips over the narrow triangle of a hand, an elbow and a knee: joints off by"
-    " 0.02 rad move the centre of mass by 15 mm, and its margin is 25 mm",
-    strict=True,
-)
 def test_a_box_too_high_for_the_demonstration_is_climbed(demo_sequence, coman):
     found = plan_or_replan(demo_sequence, coman, Scene.from_height(0.59))
     assert judge(found, simulate(found)).reached

@@ -34,6 +34,7 @@ LAYERS = [
     "sensing",
     "leaning",
     "statics",
+    "balance",
     "demo",
     "detect",
     "scaling",

@@ -58,10 +58,13 @@ class Balance:
         kin, dt = self._kin, self._period
         if not contacts:
             return
-        now, yaw, margin = self._seen(q, contacts)
-        planned, planned_yaw, _ = self._seen(reference, contacts)
-        # As seen by the robot: it may be turned from where it was planned.
-        c, s = math.cos(planned_yaw - yaw), math.sin(planned_yaw - yaw)
+        now, points, margin = self._seen(q, contacts)
+        planned, places, _ = self._seen(reference, contacts)
+        # The contacts may be turned from where they were planned, all together.
+        c = float(np.sum(points * places))
+        s = float(np.sum(points[:, 0] * places[:, 1] - points[:, 1] * places[:, 0]))
+        n = math.hypot(c, s)
+        c, s = (c / n, s / n) if n > 0 else (1.0, 0.0)
         e = np.array([c * now[0] - s * now[1], s * now[0] + c * now[1]]) - planned
         rate = (e - self._deviation) / (RATE_SMOOTHING + dt)
         self._deviation = self._deviation + dt * rate
@@ -98,17 +101,16 @@ class Balance:
 
     def _seen(
         self, q: np.ndarray, contacts: Sequence[Contact]
-    ) -> tuple[np.ndarray, float, float]:
-        """(2,) of the centre of mass from the contacts' middle, yaw, and its margin."""
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Centre of mass (2,), bearing points (K, 2), from their middle; margin."""
         kin = self._kin
         kin.update(q)
         supports = kin.world.supports
-        points = [
-            kin.bearing_points(c.surface, supports[c.support].normal, c.edge)[:, :2]
-            for c in contacts
-        ]
-        com = kin.com[:2].copy()
-        middle = np.mean([p.mean(axis=0) for p in points], axis=0)
-        R = kin.rotation(kin.world.base)
-        margin = com_margin(com, support_polygon(np.vstack(points)))
-        return com - middle, math.atan2(R[1, 0], R[0, 0]), margin
+        points = np.vstack(
+            [
+                kin.bearing_points(c.surface, supports[c.support].normal, c.edge)
+                for c in contacts
+            ]
+        )[:, :2]
+        com, middle = kin.com[:2].copy(), points.mean(axis=0)
+        return com - middle, points - middle, com_margin(com, support_polygon(points))
