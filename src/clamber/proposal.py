@@ -25,10 +25,12 @@ from scipy.optimize import brentq, least_squares
 from scipy.spatial import ConvexHull, QhullError
 
 from clamber.anatomy import (
+    DENSEST,
     Anatomy,
     Chain,
     find_limbs,
     geom_points,
+    geom_volume,
     hangs_on,
     joint_range,
     link_points,
@@ -62,7 +64,7 @@ REFERENCE_MOMENT = 28.9 * 0.512  # [kg m] mass times height of its centre of mas
 REFERENCE_INERTIA = 28.9 * 0.512**2  # [kg m^2]
 REFERENCE_KP, REFERENCE_KD, REFERENCE_KI = 600.0, 20.0, 9.0
 ARMATURE, DAMPING = 0.05, 3.0  # of a joint whose description has none
-WEAK = 0.15  # share of the largest effort: weaker joints have a light drive
+WEAK = 0.05  # share of weight times height: weaker joints have a light drive
 WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
 MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
 COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
@@ -203,6 +205,9 @@ def _upright(
         if not a.name:
             a.name = f"actuator_{len(notes)}_{a.target}"
     bodies = [b for b in spec.bodies if b.parent is spec.worldbody or _at_root(spec, b)]
+    # Of a scene that is not there, or what is worked out anew below.
+    for x in [*spec.keys, *spec.pairs, *spec.excludes, *spec.sensors]:
+        spec.delete(x)
     free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         if len(bodies) != 1:
@@ -212,16 +217,9 @@ def _upright(
                 field="worldbody",
                 value=[b.name for b in bodies],
             )
-        if any(True for _ in bodies[0].joints):
-            raise InputError(
-                "a base that floats or is fixed, not one on a joint",
-                source=path,
-                field=f"body {bodies[0].name!r}",
-            )
+        held = _release(spec, bodies[0], path)
         bodies[0].add_freejoint(name="root")
-        notes.append(f"{bodies[0].name} was fixed to the world: it floats now")
-    for k in list(spec.keys):
-        spec.delete(k)
+        notes.append(f"{bodies[0].name} was {held}: it floats now")
     for i, b in enumerate(spec.bodies):
         if not b.name:
             b.name = f"body_{i}"
@@ -250,6 +248,28 @@ def _upright(
         notes.append(f"turned by {np.degrees(turn):.0f} degrees to face along x")
         found = find_limbs(model, path, description.mimics)
     return model, found, notes
+
+
+def _release(spec: mujoco.MjSpec, base: mujoco.MjsBody, path: Path) -> str:
+    """Take away the joints that a base moves on freely; how it was held, in words."""
+    joints = list(base.joints)
+    if not joints:
+        return "fixed to the world"
+    kinds = [j.type for j in joints]
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    if (len(kinds), kinds.count(slide), kinds.count(hinge)) != (6, 3, 3):
+        raise InputError(
+            "a base that floats, is fixed, or moves on three slides and three hinges",
+            source=path,
+            field=f"body {base.name!r}",
+            value=[j.name for j in joints],
+        )
+    names = {j.name for j in joints}
+    for a in [a for a in spec.actuators if a.target in names]:
+        spec.delete(a)
+    for j in joints:
+        spec.delete(j)
+    return "on three slides and three hinges"
 
 
 def _at_root(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> bool:
@@ -322,7 +342,7 @@ def link_shapes(
     model: mujoco.MjModel, data: mujoco.MjData
 ) -> tuple[list[Shape], list[str]]:
     """Collision shapes of all links, and notes on those that had to be made up."""
-    links, shapes, notes = links_of(model), [], []
+    links, shapes, notes, thin = links_of(model), [], [], []
     kinds = {
         mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
         mujoco.mjtGeom.mjGEOM_CAPSULE: ("capsule", 2),
@@ -331,10 +351,20 @@ def link_shapes(
         mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
     }
     for link in sorted(set(links[1:].tolist())):
+        body, mass = model.body(link).name, float(model.body_mass[links == link].sum())
         geoms = np.flatnonzero(links[model.geom_bodyid] == link)
         solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        drawn = [g for g in geoms if g not in solid]
+        bulk, seen = (
+            sum(geom_volume(model, int(g)) for g in x) for x in (solid, drawn)
+        )
+        if (solid or mass >= HEAVY) and mass > DENSEST * bulk and seen > bulk:
+            points = np.concatenate([geom_points(model, data, int(g)) for g in geoms])
+            shapes.append(_around(f"link_{body}_0", link, points, data))
+            thin.append(body)
+            continue
         for g in solid:
-            name = f"link_{model.body(link).name}_{len(shapes)}"
+            name = f"link_{body}_{len(shapes)}"
             kind = mujoco.mjtGeom(int(model.geom_type[g]))
             if kind in kinds:
                 word, n = kinds[kind]
@@ -344,17 +374,14 @@ def link_shapes(
             elif kind == mujoco.mjtGeom.mjGEOM_MESH:
                 points = geom_points(model, data, int(g))
                 shapes.append(_around(name, link, points, data))
-        mass = float(model.body_mass[links == link].sum())
-        if solid or mass < HEAVY:
-            continue
-        body, name = model.body(link).name, f"link_{model.body(link).name}_0"
-        if len(geoms):
-            points = np.concatenate([geom_points(model, data, int(g)) for g in geoms])
-            shapes.append(_around(name, link, points, data))
-            notes.append(f"{body} has no collision geometry: what is seen is taken")
-        else:
-            shapes.append(_of_inertia(name, link, model, data))
+        if not solid and mass >= HEAVY:
+            shapes.append(_of_inertia(f"link_{body}_0", link, model, data))
             notes.append(f"{body} has no geometry: a box of its inertia is taken")
+    if thin:
+        notes.append(
+            "no collision geometry, or too little for its mass, so that what is seen is"
+            f" taken: {', '.join(thin)}"
+        )
     return shapes, notes
 
 
@@ -875,10 +902,9 @@ def _gains(
             "ki": _two_digits(ki),
         }
     }
-    largest = max(effort.values())
     drives, impedance = {}, {}
     for j in _moving(found):
-        weak = effort[model.joint(j).name] < WEAK * largest
+        weak = effort[model.joint(j).name] < WEAK * mass * 9.81 * height
         if weak:
             gains[model.joint(j).name] = {
                 "kp": _two_digits(WEAK_KP * kp),
