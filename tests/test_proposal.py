@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 
 import mujoco
@@ -236,6 +237,15 @@ def test_what_is_no_humanoid_is_refused(tmp_path):
     )
     with pytest.raises(InputError, match="two legs and two arms"):
         propose_robot(path)
+
+
+def test_a_refusal_says_which_limbs_there_are_and_what_else_moves(tmp_path):
+    text = humanoids.mjcf()
+    for j in "abcd":  # arms whose joints are fixed, as models for walking have them
+        text = re.sub(rf'<joint name="[vw]{j}"[^>]*/>', "", text)
+    said = r"found t1 and u1; other joints that move: ba, bb, bc, ha\)"
+    with pytest.raises(InputError, match=said):
+        propose_robot(described(tmp_path, "mjcf", text))
 
 
 def test_a_link_without_geometry_gets_some_and_a_note(tmp_path):

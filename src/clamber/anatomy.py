@@ -23,6 +23,7 @@ from clamber.errors import InputError
 
 MIRRORED = 0.05  # share of the height: limbs this near to each other's mirror image
 LEAST_JOINTS = 3  # of a limb
+NAMED = 8  # joints, at most, in a message
 SWEEP = 9  # samples of a joint's range
 UNLIMITED = np.pi  # [rad] sweep of a joint without limits
 DENSEST = 3000.0  # [kg/m^3] of mass over collision geometry: links are no ghosts
@@ -121,8 +122,8 @@ def find_limbs(
     pairs = _paired(model, data, base, grips)
     if len(pairs) < 2:
         raise InputError(
-            "two legs and two arms, mirror images of each other at the zero posture"
-            f" (found {len(pairs)} pairs of limbs with {LEAST_JOINTS} joints or more)",
+            "two legs and two arms, mirror images of each other at the zero posture, of"
+            f" {LEAST_JOINTS} joints or more ({_found(model, pairs)})",
             source=source,
             field="kinematic tree",
         )
@@ -161,6 +162,23 @@ def find_limbs(
         trunk=tuple(sorted(carrying)),
         locked=tuple(sorted(set(range(model.njnt)) - used - carrying - {free[0]})),
         forward=forward,
+    )
+
+
+def _found(model: mujoco.MjModel, pairs: list[tuple[int, int]]) -> str:
+    """Which limbs there are, and which joints are left that could make others."""
+    limbs = [b for p in pairs for b in p]
+    rest = [
+        model.joint(j).name
+        for j in range(model.njnt)
+        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE
+        and not any(hangs_on(model, int(model.jnt_bodyid[j]), b) for b in limbs)
+    ]
+    names = [f"{model.body(a).name} and {model.body(b).name}" for a, b in pairs]
+    return (
+        f"found {', '.join(names) or 'none'}; other joints that move: "
+        + (", ".join(rest[:NAMED]) or "none")
+        + (f" and {len(rest) - NAMED} more" if len(rest) > NAMED else "")
     )
 
 
