@@ -403,6 +403,23 @@ def test_a_joint_is_weak_by_weight_times_height_not_beside_the_strongest(tmp_pat
     assert set(gains) == {"default", *(f"{s}{j}" for s in "vw" for j in "abcd")}
 
 
+def test_weak_ankles_stand_under_the_centre_of_mass(tmp_path):
+    text = humanoids.mjcf()
+    weak = text.replace("-60.0 60.0", "-5.0 5.0")
+    ahead = []
+    for t in (text, weak):
+        save_proposal(propose_robot(described(tmp_path, "mjcf", t)), tmp_path)
+        robot = load_robot(tmp_path / "robot.yaml")
+        assert check_robot(robot).faults == ()
+        kin = Kinematics(build_world(robot, Scene(start=np.zeros(3))))
+        kin.update(kin.world.home)
+        ankle = kin.landmark(robot.limbs["left_leg"].end)[1]
+        ahead.append(kin.com[0] - ankle[0])
+    assert ahead[0] == pytest.approx(0.03, abs=2e-3)  # the middle of the sole
+    weight = kin.world.mass * 9.81
+    assert ahead[1] == pytest.approx(0.5 * 5.0 / (0.5 * weight), abs=2e-3)
+
+
 def test_a_thumb_of_more_joints_than_a_finger_is_no_part_of_the_arm(tmp_path):
     hinge = '<joint name="{0}" axis="0 0 1" range="0 1"/>'
     ball = '<geom type="sphere" size="0.008" mass="0.01"/>'

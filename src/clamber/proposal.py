@@ -57,6 +57,7 @@ KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
+ANKLE_SHARE = 0.5  # of the ankles' effort, at most, that the nominal posture asks for
 LIMIT_ROOM = 0.05  # [rad] that the nominal posture keeps from joint limits
 # Gains and inertia of a joint by the robot's weight times height, as the built-in
 # robot's are.
@@ -138,9 +139,9 @@ def propose_robot(
     shapes, more = link_shapes(model, data)
     notes += more
     shapes, limbs = _with_surfaces(model, data, found, shapes, path)
-    home = nominal_posture(model, found, limbs)
     known = {} if effort_from is None else _known_efforts(Path(effort_from))
     effort, guessed = _efforts(model, data, found, known)
+    home = nominal_posture(model, found, effort)
     if guessed:
         notes.append(
             f"no effort limit in the description for {len(guessed)} joints: those under"
@@ -669,13 +670,14 @@ def _largest_rectangle(
 
 
 def nominal_posture(
-    model: mujoco.MjModel, found: Anatomy, limbs: dict | None = None
+    model: mujoco.MjModel, found: Anatomy, effort: dict[str, float]
 ) -> dict[str, float]:
     """Knees bent, soles level under the centre of mass, hands ready; joint angles.
 
     Legs are solved for a level foot, abreast of where it is at the zero posture and
-    ahead so that the centre of mass is over the middle of the soles; arms for the
-    directions of upper arm and forearm that the built-in robot has.
+    ahead so that the centre of mass is over the middle of the soles, or as near to it
+    as leaves ankles half of their effort; arms for the directions of upper arm and
+    forearm that the built-in robot has.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -696,7 +698,8 @@ def nominal_posture(
         middle = np.mean(
             [_foot(model, data, found.limbs[n])[0][0] for n in zero], axis=0
         )
-        ahead += float(data.subtree_com[found.base][0] - middle)
+        low, high = _over_ankles(model, data, found, effort)
+        ahead += float(data.subtree_com[found.base][0] - np.clip(middle, low, high))
     out = {}
     for name in ("left_arm", "right_arm", "left_leg", "right_leg"):
         for j in found.limbs[name].joints:
@@ -704,6 +707,27 @@ def nominal_posture(
             if abs(angle) > 5e-4:
                 out[model.joint(j).name] = round(angle, 4)
     return out
+
+
+def _over_ankles(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    found: Anatomy,
+    effort: dict[str, float],
+) -> tuple[float, float]:
+    """How far back and ahead ankles hold the centre of mass with half of their effort.
+
+    [m] along x; each leg bears half of the weight.
+    """
+    weight = 9.81 * float(model.body_subtreemass[found.base])
+    low, high = -np.inf, np.inf
+    for chain in (c for n, c in found.limbs.items() if n.endswith("leg")):
+        for j in chain.joints[chain.bend + 1 :]:
+            torque = ANKLE_SHARE * effort[model.joint(j).name]
+            reach = torque / (0.5 * weight * max(abs(float(data.xaxis[j, 1])), 1e-9))
+            x = float(data.xanchor[j, 0])
+            low, high = max(low, x - reach), min(high, x + reach)
+    return low, high
 
 
 def _foot(
