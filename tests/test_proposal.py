@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 
 import mujoco
@@ -11,7 +12,7 @@ import pytest
 import yaml
 
 import humanoids
-from clamber.anatomy import find_limbs, geom_points, joint_range
+from clamber.anatomy import find_limbs, geom_points, geom_volume, joint_range
 from clamber.checkup import check_robot
 from clamber.errors import InputError
 from clamber.io import save_proposal
@@ -238,6 +239,15 @@ def test_what_is_no_humanoid_is_refused(tmp_path):
         propose_robot(path)
 
 
+def test_a_refusal_says_which_limbs_there_are_and_what_else_moves(tmp_path):
+    text = humanoids.mjcf()
+    for j in "abcd":  # arms whose joints are fixed, as models for walking have them
+        text = re.sub(rf'<joint name="[vw]{j}"[^>]*/>', "", text)
+    said = r"found t1 and u1; other joints that move: ba, bb, bc, ha\)"
+    with pytest.raises(InputError, match=said):
+        propose_robot(described(tmp_path, "mjcf", text))
+
+
 def test_a_link_without_geometry_gets_some_and_a_note(tmp_path):
     text = humanoids.mjcf()
     first = text.index('<geom type="capsule"', text.index('name="t2"'))
@@ -308,6 +318,148 @@ def test_the_g1_of_a_wheel_is_found_where_it_is_installed(tmp_path):
     assert found.faults == ()
     assert found.joints == 29
     assert found.knee_height == pytest.approx(0.351, abs=0.002)
+
+
+def test_shapes_too_thin_for_their_mass_give_way_to_what_is_seen(tmp_path):
+    text = humanoids.mjcf()
+    for tag in ("t2", "u2"):
+        first = text.index('<geom type="capsule"', text.index(f'name="{tag}"'))
+        end = text.index("/>", first) + 2
+        seen = text[first:end].replace("<geom", '<geom contype="0" conaffinity="0"')
+        thin = '<geom type="sphere" size="0.01" mass="0.01"/>'
+        text = text[:first] + seen + thin + text[end:]
+    proposal = propose_robot(described(tmp_path, "mjcf", text))
+    assert any("too little" in n and n.endswith("t2, u2") for n in proposal.notes)
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    plain = mujoco.MjModel.from_xml_string(
+        propose_robot(described(tmp_path, "mjcf")).mjcf
+    )
+    bulk = [
+        sum(
+            geom_volume(m, g)
+            for g in range(m.ngeom)
+            if m.geom(g).name.startswith("LKnee_")
+        )
+        for m in (model, plain)
+    ]
+    assert bulk[0] == pytest.approx(bulk[1], rel=0.15)
+    save_proposal(proposal, tmp_path)
+    assert check_robot(load_robot(tmp_path / "robot.yaml")).faults == ()
+
+
+SIX = "".join(
+    f'<joint name="r{i}" type="{kind}" axis="{axis}"/>'
+    for i, (kind, axis) in enumerate(
+        (kind, axis)
+        for kind in ("slide", "hinge")
+        for axis in ("1 0 0", "0 1 0", "0 0 1")
+    )
+)
+
+
+def test_a_base_on_three_slides_and_three_hinges_floats(tmp_path):
+    text = humanoids.mjcf().replace("<freejoint/>", SIX)
+    text = text.replace(
+        "</mujoco>", '<actuator><motor joint="r0"/></actuator></mujoco>'
+    )
+    proposal = propose_robot(described(tmp_path, "mjcf", text))
+    free = propose_robot(described(tmp_path, "mjcf"))
+    assert proposal.mjcf == free.mjcf
+    assert proposal.fields == free.fields
+    assert any("b0 was on three slides" in n for n in proposal.notes)
+
+
+def test_a_base_on_a_rail_is_refused(tmp_path):
+    text = humanoids.mjcf().replace("<freejoint/>", '<joint name="r" type="slide"/>')
+    with pytest.raises(InputError, match=r"b0.*\['r'\].*three slides"):
+        propose_robot(described(tmp_path, "mjcf", text))
+
+
+def test_what_names_a_scene_that_is_not_there_is_no_obstacle(tmp_path):
+    text = humanoids.mjcf().replace(
+        '<geom type="box"', '<geom name="toe" type="box"', 1
+    )
+    plain = propose_robot(described(tmp_path, "mjcf", text)).mjcf
+    pair = '<contact><pair geom1="ground" geom2="toe"/></contact></mujoco>'
+    there = propose_robot(
+        described(tmp_path, "mjcf", text.replace("</mujoco>", pair))
+    ).mjcf
+    assert there == plain
+
+
+def test_a_joint_is_weak_by_weight_times_height_not_beside_the_strongest(tmp_path):
+    strong = humanoids.mjcf()
+    for side in "tu":  # knees ten times as strong: ankles are what they were
+        strong = strong.replace(
+            f'name="{side}d" axis="1 0 0" range="-2.3 0.0" actuatorfrcrange="-80.0 80',
+            f'name="{side}d" axis="1 0 0" range="-2.3 0.0" actuatorfrcrange="-800 800',
+        )
+    assert strong.count("-800 800") == 2
+    gains = propose_robot(described(tmp_path, "mjcf", strong)).fields["gains"]
+    assert list(gains) == ["default"]
+    # 30 kg times 0.6 m is 170 N m: 2 N m are a twentieth of what ankles have, and weak.
+    weak = humanoids.mjcf().replace("-50.0 50.0", "-2.0 2.0")
+    gains = propose_robot(described(tmp_path, "mjcf", weak)).fields["gains"]
+    assert set(gains) == {"default", *(f"{s}{j}" for s in "vw" for j in "abcd")}
+
+
+def test_weak_ankles_stand_under_the_centre_of_mass(tmp_path):
+    text = humanoids.mjcf()
+    weak = text.replace("-60.0 60.0", "-5.0 5.0")
+    ahead = []
+    for t in (text, weak):
+        save_proposal(propose_robot(described(tmp_path, "mjcf", t)), tmp_path)
+        robot = load_robot(tmp_path / "robot.yaml")
+        assert check_robot(robot).faults == ()
+        kin = Kinematics(build_world(robot, Scene(start=np.zeros(3))))
+        kin.update(kin.world.home)
+        ankle = kin.landmark(robot.limbs["left_leg"].end)[1]
+        ahead.append(kin.com[0] - ankle[0])
+    assert ahead[0] == pytest.approx(0.03, abs=2e-3)  # the middle of the sole
+    weight = kin.world.mass * 9.81
+    assert ahead[1] == pytest.approx(0.5 * 5.0 / (0.5 * weight), abs=2e-3)
+
+
+def test_a_thumb_of_more_joints_than_a_finger_is_no_part_of_the_arm(tmp_path):
+    hinge = '<joint name="{0}" axis="0 0 1" range="0 1"/>'
+    ball = '<geom type="sphere" size="0.008" mass="0.01"/>'
+
+    def hand(tag: str) -> str:
+        fingers = "".join(
+            f'<body name="{tag}f{i}" pos="0 {0.02 * i} {-humanoids.FORE}">'
+            + hinge.format(f"{tag}g{i}")
+            + ball
+            + f'<body pos="0 0 -0.02">{hinge.format(f"{tag}h{i}")}{ball}</body></body>'
+            for i in (-1, 0, 1)
+        )
+        thumb = (
+            f'<body pos="0.02 0 {-humanoids.FORE}">{hinge.format(tag + "k")}{ball}'
+            f'<body pos="0 0 -0.01">{hinge.format(tag + "g9")}{ball}'
+            f'<body pos="0 0 -0.01">{hinge.format(tag + "h9")}{ball}</body>'
+            "</body></body>"
+        )
+        return fingers + thumb
+
+    text = humanoids.mjcf()
+    for tag in "vw":
+        end = text.index("/>", text.index("<geom", text.index(f'name="{tag}2"'))) + 2
+        text = text[:end] + hand(tag) + text[end:]
+    couplings = "".join(
+        f'<joint joint1="{tag}h{i}" joint2="{tag}g{i}"/>'
+        for tag in "vw"
+        for i in (-1, 0, 1, 9)
+    )
+    text = text.replace("</mujoco>", f"<equality>{couplings}</equality></mujoco>")
+    model = mujoco.MjModel.from_xml_string(text)
+    mimics = {f"{t}h{i}": f"{t}g{i}" for t in "vw" for i in (-1, 0, 1, 9)}
+    found = find_limbs(model, "hands", mimics)
+    for side, tag in (("left", "v"), ("right", "w")):
+        arm = found.limbs[f"{side}_arm"]
+        assert model.body(arm.end).name == f"{tag}2"
+        assert [model.joint(j).name for j in arm.joints] == [
+            f"{tag}{x}" for x in "abcd"
+        ]
+        assert len(arm.beyond) == 9
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from clamber.statics import (
     polygon_halfplanes,
     projected_distance,
     static_equilibrium,
+    strength_needed,
     support_ellipse,
     support_polygon,
     theta_max,
@@ -747,6 +749,51 @@ def test_torque_limits_lower_the_margin_and_name_the_weak_joint():
         limits[k] = 9.0  # a little more than (a - mu h) m g / 2 = 7.4 N m
         assert 0 < verdict(limits).margin < free.margin
         assert verdict(limits).limiting == weak
+
+
+def test_the_strength_that_is_needed_is_that_computed_by_hand():
+    """Upright forces on ice, and none that friction would turn inwards: a m g / 2."""
+    needed = A_LEG * WEIGHT / 2
+    for limit in (0.1 * needed, needed, 3.0 * needed):
+        feet, torque = a_frame(limit)
+        torque = replace(torque, limits=np.array([limit, 10.0 * limit]))
+        found = strength_needed(
+            feet,
+            np.tile(UP, (2, 1)),
+            np.full(2, 1e-9),
+            np.zeros(3),
+            MASS,
+            torque=torque,
+        )
+        assert found is not None
+        share, joint = found
+        assert share == pytest.approx(needed / limit, rel=1e-5)
+        assert torque.names[joint] == "left_hip"
+    feet, torque = a_frame(needed)
+    normals, mu = np.tile(UP, (2, 1)), np.full(2, 0.5)
+    beside = np.array([2.0 * A_LEG, 0.0, 0.0])  # no strength stands beside its feet
+    assert strength_needed(feet, normals, mu, beside, MASS, torque=torque) is None
+    none = feet[:0], normals[:0], mu[:0]
+    assert strength_needed(*none, np.zeros(3), MASS, torque=torque) is None
+
+
+def test_the_strength_that_is_needed_is_where_postures_begin_to_hold():
+    feet, torque = a_frame(1.0)
+    apart = np.array([0.0, 0.1, 0.0])
+    feet = np.r_[feet + apart, feet - apart]
+    torque = replace(torque, jacobian=np.tile(torque.jacobian, (2, 1)))
+    stance = feet, np.tile(UP, (4, 1)), np.full(4, 0.1), np.zeros(3), MASS
+    share, _ = strength_needed(*stance, torque=torque)
+    for more, holds in ((0.99, False), (1.01, True)):
+        limits = share * more * torque.limits
+        assert (
+            static_equilibrium(
+                *stance,
+                names=["left_foot", "right_foot"] * 2,
+                torque=replace(torque, limits=limits),
+            ).feasible
+            is holds
+        )
 
 
 def test_the_rows_of_the_base_are_the_balance_of_the_whole_body():

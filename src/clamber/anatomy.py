@@ -23,8 +23,10 @@ from clamber.errors import InputError
 
 MIRRORED = 0.05  # share of the height: limbs this near to each other's mirror image
 LEAST_JOINTS = 3  # of a limb
+NAMED = 8  # joints, at most, in a message
 SWEEP = 9  # samples of a joint's range
 UNLIMITED = np.pi  # [rad] sweep of a joint without limits
+DENSEST = 3000.0  # [kg/m^3] of mass over collision geometry: links are no ghosts
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -120,8 +122,8 @@ def find_limbs(
     pairs = _paired(model, data, base, grips)
     if len(pairs) < 2:
         raise InputError(
-            "two legs and two arms, mirror images of each other at the zero posture"
-            f" (found {len(pairs)} pairs of limbs with {LEAST_JOINTS} joints or more)",
+            "two legs and two arms, mirror images of each other at the zero posture, of"
+            f" {LEAST_JOINTS} joints or more ({_found(model, pairs)})",
             source=source,
             field="kinematic tree",
         )
@@ -163,6 +165,23 @@ def find_limbs(
     )
 
 
+def _found(model: mujoco.MjModel, pairs: list[tuple[int, int]]) -> str:
+    """Which limbs there are, and which joints are left that could make others."""
+    limbs = [b for p in pairs for b in p]
+    rest = [
+        model.joint(j).name
+        for j in range(model.njnt)
+        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE
+        and not any(hangs_on(model, int(model.jnt_bodyid[j]), b) for b in limbs)
+    ]
+    names = [f"{model.body(a).name} and {model.body(b).name}" for a, b in pairs]
+    return (
+        f"found {', '.join(names) or 'none'}; other joints that move: "
+        + (", ".join(rest[:NAMED]) or "none")
+        + (f" and {len(rest) - NAMED} more" if len(rest) > NAMED else "")
+    )
+
+
 def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
     first = int(model.body_jntadr[body])
     return list(range(first, first + int(model.body_jntnum[body])))
@@ -189,14 +208,15 @@ def _way_out(model: mujoco.MjModel, body: int, grips: frozenset[int]) -> list[in
     """Bodies with joints from one on, until the chain ends or branches into fingers."""
     way = [body]
     while True:
-        children = [b for b in _moving_children(model, way[-1]) if b not in grips]
-        if not children:
+        children = _moving_children(model, way[-1])
+        onward = [b for b in children if b not in grips]
+        if not onward:
             return way
         # Fingers are alike: the limb goes on where one child has most of the joints.
-        joints = [_count(model, c) for c in children]
-        if max(joints) < 0.6 * sum(joints):
+        joints = [_count(model, c) for c in onward]
+        if max(joints) < 0.6 * sum(_count(model, c) for c in children):
             return way
-        way.append(children[int(np.argmax(joints))])
+        way.append(onward[int(np.argmax(joints))])
 
 
 def _count(model: mujoco.MjModel, body: int) -> int:
@@ -429,3 +449,21 @@ def geom_points(
             )
     R = data.geom_xmat[geom].reshape(3, 3)
     return local @ R.T + data.geom_xpos[geom]
+
+
+def geom_volume(model: mujoco.MjModel, geom: int) -> float:
+    """Volume of a geom [m^3], of a mesh half of its bounding box."""
+    kinds, s = mujoco.mjtGeom, model.geom_size[geom]
+    kind = kinds(int(model.geom_type[geom]))
+    ball = 4 / 3 * np.pi
+    if kind == kinds.mjGEOM_SPHERE:
+        return float(ball * s[0] ** 3)
+    if kind == kinds.mjGEOM_CAPSULE:
+        return float(ball * s[0] ** 3 + 2 * np.pi * s[0] ** 2 * s[1])
+    if kind == kinds.mjGEOM_CYLINDER:
+        return float(2 * np.pi * s[0] ** 2 * s[1])
+    if kind == kinds.mjGEOM_ELLIPSOID:
+        return float(ball * s.prod())
+    if kind == kinds.mjGEOM_BOX:
+        return float(8 * s.prod())
+    return float(4 * model.geom_aabb[geom, 3:].prod())

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber.anatomy import DENSEST, geom_volume
 from clamber.errors import InputError
 from clamber.model import Kinematics, Robot, World, build_world, limb_lengths
 from clamber.pipeline import check_start
@@ -20,7 +21,6 @@ SAME_HEIGHT = 0.005  # [m] of both soles
 STRAIGHT = np.radians(10.0)  # a limb bent by less is straight
 HEAVY = 1.0  # [kg] a link this heavy needs collision geometry
 UNLIKE = 0.02  # share by which the lengths of left and right limbs may differ
-DENSEST = 3000.0  # [kg/m^3] of mass over collision geometry: links are no ghosts
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -153,7 +153,7 @@ def _geometry_faults(world: World) -> list[str]:
                 " geometry"
             )
     mine = [g for g in np.flatnonzero(solid) if m.geom_bodyid[g] in own]
-    bulk = sum(_volume(m, int(g)) for g in mine)
+    bulk = sum(geom_volume(m, int(g)) for g in mine)
     if bulk * DENSEST < world.mass:
         out.append(
             f"collision geometry of {1e3 * bulk:.1f} l is too little for"
@@ -169,24 +169,6 @@ def _geometry_faults(world: World) -> list[str]:
             met.add(tuple(sorted(m.body(b).name for b in bodies)))
     out += [f"{a} and {b} overlap as it stands" for a, b in sorted(met)]
     return out
-
-
-def _volume(model: mujoco.MjModel, geom: int) -> float:
-    """[m^3], of a mesh half of its bounding box."""
-    kinds, s = mujoco.mjtGeom, model.geom_size[geom]
-    kind = kinds(int(model.geom_type[geom]))
-    ball = 4 / 3 * np.pi
-    if kind == kinds.mjGEOM_SPHERE:
-        return float(ball * s[0] ** 3)
-    if kind == kinds.mjGEOM_CAPSULE:
-        return float(ball * s[0] ** 3 + 2 * np.pi * s[0] ** 2 * s[1])
-    if kind == kinds.mjGEOM_CYLINDER:
-        return float(2 * np.pi * s[0] ** 2 * s[1])
-    if kind == kinds.mjGEOM_ELLIPSOID:
-        return float(ball * s.prod())
-    if kind == kinds.mjGEOM_BOX:
-        return float(8 * s.prod())
-    return float(4 * model.geom_aabb[geom, 3:].prod())
 
 
 def check_scene(scene: Scene) -> dict[str, str]:

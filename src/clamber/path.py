@@ -19,7 +19,7 @@ from clamber.contact import Contact
 from clamber.errors import Status
 from clamber.model import Kinematics, World
 from clamber.posture.ik import IK, ContactGoal, PostureProblem, support_rotation
-from clamber.posture.keyframe import contact_drift, holds
+from clamber.posture.keyframe import contact_drift, holds, weakness
 from clamber.scene import Support
 from clamber.transition import CLEARANCE, Transition, balance_problem
 
@@ -366,7 +366,7 @@ def check_phases(
     ends the transition has looked at, and while weight shifts more contacts bear.
     """
     kin, world = ik.kin, ik.world
-    worst, weak, note = 0.0, False, ""
+    worst, weak, note = 0.0, "", ""
     moving = (*t.leaving, t.move.makes) if t.move.makes else t.leaving
     for phase in phases:
         watched = watched_pairs(world, (*phase.contacts, *moving))
@@ -382,8 +382,8 @@ def check_phases(
                 if drift > DRIFT_LIMIT:
                     where = f"{1e3 * drift:.0f} mm ({phase.kind})"
                     return Status.UNREACHABLE, f"a contact opens by {where}"
-            if phase.kind == "swing":
-                weak = weak or not holds(kin, phase.load_after)
+            if phase.kind == "swing" and not weak and not holds(kin, phase.load_after):
+                weak = weakness(kin, phase.load_after)
     if worst > OVERLAP_LIMIT:
         return Status.COLLIDING, note
-    return (Status.OVERLOADED, "") if weak else (Status.SOLVED, note)
+    return (Status.OVERLOADED, weak) if weak else (Status.SOLVED, note)

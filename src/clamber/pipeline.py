@@ -19,7 +19,7 @@ from clamber.moves import Skipped, Step, split_moves
 from clamber.path import Path, Phase, overlap, watched_pairs
 from clamber.policy import GeneralPolicy
 from clamber.posture.ik import IK
-from clamber.posture.keyframe import Keyframe, KeyframeOptions
+from clamber.posture.keyframe import Keyframe, KeyframeOptions, weakness
 from clamber.scaling import retarget
 from clamber.scene import Scene
 from clamber.search import Found, plan_steps, standing
@@ -273,10 +273,12 @@ def check_start(ik: IK, start: Keyframe) -> None:
             value=" and ".join(names),
         )
     if start.com_margin < 0 or not start.equilibrium.feasible:
-        limit = start.equilibrium.limiting
+        why = f"its mass is {-1e3 * start.com_margin:.0f} mm beside its soles"
+        if start.com_margin >= 0:
+            ik.kin.update(start.q)
+            why = weakness(ik.kin, start.stance)
         raise InputError(
-            "a posture that stands within the effort limits"
-            + (f" ({limit} gives way)" if limit else ""),
+            f"a posture that stands within the effort limits ({why})",
             field="robot.home",
         )
 

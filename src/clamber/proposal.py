@@ -25,10 +25,12 @@ from scipy.optimize import brentq, least_squares
 from scipy.spatial import ConvexHull, QhullError
 
 from clamber.anatomy import (
+    DENSEST,
     Anatomy,
     Chain,
     find_limbs,
     geom_points,
+    geom_volume,
     hangs_on,
     joint_range,
     link_points,
@@ -55,6 +57,7 @@ KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
+ANKLE_SHARE = 0.5  # of the ankles' effort, at most, that the nominal posture asks for
 LIMIT_ROOM = 0.05  # [rad] that the nominal posture keeps from joint limits
 # Gains and inertia of a joint by the robot's weight times height, as the built-in
 # robot's are.
@@ -62,7 +65,7 @@ REFERENCE_MOMENT = 28.9 * 0.512  # [kg m] mass times height of its centre of mas
 REFERENCE_INERTIA = 28.9 * 0.512**2  # [kg m^2]
 REFERENCE_KP, REFERENCE_KD, REFERENCE_KI = 600.0, 20.0, 9.0
 ARMATURE, DAMPING = 0.05, 3.0  # of a joint whose description has none
-WEAK = 0.15  # share of the largest effort: weaker joints have a light drive
+WEAK = 0.05  # share of weight times height: weaker joints have a light drive
 WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
 MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
 COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
@@ -136,9 +139,9 @@ def propose_robot(
     shapes, more = link_shapes(model, data)
     notes += more
     shapes, limbs = _with_surfaces(model, data, found, shapes, path)
-    home = nominal_posture(model, found, limbs)
     known = {} if effort_from is None else _known_efforts(Path(effort_from))
     effort, guessed = _efforts(model, data, found, known)
+    home = nominal_posture(model, found, effort)
     if guessed:
         notes.append(
             f"no effort limit in the description for {len(guessed)} joints: those under"
@@ -203,6 +206,9 @@ def _upright(
         if not a.name:
             a.name = f"actuator_{len(notes)}_{a.target}"
     bodies = [b for b in spec.bodies if b.parent is spec.worldbody or _at_root(spec, b)]
+    # Of a scene that is not there, or what is worked out anew below.
+    for x in [*spec.keys, *spec.pairs, *spec.excludes, *spec.sensors]:
+        spec.delete(x)
     free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
     if not free:
         if len(bodies) != 1:
@@ -212,16 +218,9 @@ def _upright(
                 field="worldbody",
                 value=[b.name for b in bodies],
             )
-        if any(True for _ in bodies[0].joints):
-            raise InputError(
-                "a base that floats or is fixed, not one on a joint",
-                source=path,
-                field=f"body {bodies[0].name!r}",
-            )
+        held = _release(spec, bodies[0], path)
         bodies[0].add_freejoint(name="root")
-        notes.append(f"{bodies[0].name} was fixed to the world: it floats now")
-    for k in list(spec.keys):
-        spec.delete(k)
+        notes.append(f"{bodies[0].name} was {held}: it floats now")
     for i, b in enumerate(spec.bodies):
         if not b.name:
             b.name = f"body_{i}"
@@ -250,6 +249,28 @@ def _upright(
         notes.append(f"turned by {np.degrees(turn):.0f} degrees to face along x")
         found = find_limbs(model, path, description.mimics)
     return model, found, notes
+
+
+def _release(spec: mujoco.MjSpec, base: mujoco.MjsBody, path: Path) -> str:
+    """Take away the joints that a base moves on freely; how it was held, in words."""
+    joints = list(base.joints)
+    if not joints:
+        return "fixed to the world"
+    kinds = [j.type for j in joints]
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    if (len(kinds), kinds.count(slide), kinds.count(hinge)) != (6, 3, 3):
+        raise InputError(
+            "a base that floats, is fixed, or moves on three slides and three hinges",
+            source=path,
+            field=f"body {base.name!r}",
+            value=[j.name for j in joints],
+        )
+    names = {j.name for j in joints}
+    for a in [a for a in spec.actuators if a.target in names]:
+        spec.delete(a)
+    for j in joints:
+        spec.delete(j)
+    return "on three slides and three hinges"
 
 
 def _at_root(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> bool:
@@ -322,7 +343,7 @@ def link_shapes(
     model: mujoco.MjModel, data: mujoco.MjData
 ) -> tuple[list[Shape], list[str]]:
     """Collision shapes of all links, and notes on those that had to be made up."""
-    links, shapes, notes = links_of(model), [], []
+    links, shapes, notes, thin = links_of(model), [], [], []
     kinds = {
         mujoco.mjtGeom.mjGEOM_SPHERE: ("sphere", 1),
         mujoco.mjtGeom.mjGEOM_CAPSULE: ("capsule", 2),
@@ -331,10 +352,20 @@ def link_shapes(
         mujoco.mjtGeom.mjGEOM_BOX: ("box", 3),
     }
     for link in sorted(set(links[1:].tolist())):
+        body, mass = model.body(link).name, float(model.body_mass[links == link].sum())
         geoms = np.flatnonzero(links[model.geom_bodyid] == link)
         solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+        drawn = [g for g in geoms if g not in solid]
+        bulk, seen = (
+            sum(geom_volume(model, int(g)) for g in x) for x in (solid, drawn)
+        )
+        if (solid or mass >= HEAVY) and mass > DENSEST * bulk and seen > bulk:
+            points = np.concatenate([geom_points(model, data, int(g)) for g in geoms])
+            shapes.append(_around(f"link_{body}_0", link, points, data))
+            thin.append(body)
+            continue
         for g in solid:
-            name = f"link_{model.body(link).name}_{len(shapes)}"
+            name = f"link_{body}_{len(shapes)}"
             kind = mujoco.mjtGeom(int(model.geom_type[g]))
             if kind in kinds:
                 word, n = kinds[kind]
@@ -344,17 +375,14 @@ def link_shapes(
             elif kind == mujoco.mjtGeom.mjGEOM_MESH:
                 points = geom_points(model, data, int(g))
                 shapes.append(_around(name, link, points, data))
-        mass = float(model.body_mass[links == link].sum())
-        if solid or mass < HEAVY:
-            continue
-        body, name = model.body(link).name, f"link_{model.body(link).name}_0"
-        if len(geoms):
-            points = np.concatenate([geom_points(model, data, int(g)) for g in geoms])
-            shapes.append(_around(name, link, points, data))
-            notes.append(f"{body} has no collision geometry: what is seen is taken")
-        else:
-            shapes.append(_of_inertia(name, link, model, data))
+        if not solid and mass >= HEAVY:
+            shapes.append(_of_inertia(f"link_{body}_0", link, model, data))
             notes.append(f"{body} has no geometry: a box of its inertia is taken")
+    if thin:
+        notes.append(
+            "no collision geometry, or too little for its mass, so that what is seen is"
+            f" taken: {', '.join(thin)}"
+        )
     return shapes, notes
 
 
@@ -642,13 +670,14 @@ def _largest_rectangle(
 
 
 def nominal_posture(
-    model: mujoco.MjModel, found: Anatomy, limbs: dict | None = None
+    model: mujoco.MjModel, found: Anatomy, effort: dict[str, float]
 ) -> dict[str, float]:
     """Knees bent, soles level under the centre of mass, hands ready; joint angles.
 
     Legs are solved for a level foot, abreast of where it is at the zero posture and
-    ahead so that the centre of mass is over the middle of the soles; arms for the
-    directions of upper arm and forearm that the built-in robot has.
+    ahead so that the centre of mass is over the middle of the soles, or as near to it
+    as leaves ankles half of their effort; arms for the directions of upper arm and
+    forearm that the built-in robot has.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -669,7 +698,8 @@ def nominal_posture(
         middle = np.mean(
             [_foot(model, data, found.limbs[n])[0][0] for n in zero], axis=0
         )
-        ahead += float(data.subtree_com[found.base][0] - middle)
+        low, high = _over_ankles(model, data, found, effort)
+        ahead += float(data.subtree_com[found.base][0] - np.clip(middle, low, high))
     out = {}
     for name in ("left_arm", "right_arm", "left_leg", "right_leg"):
         for j in found.limbs[name].joints:
@@ -677,6 +707,27 @@ def nominal_posture(
             if abs(angle) > 5e-4:
                 out[model.joint(j).name] = round(angle, 4)
     return out
+
+
+def _over_ankles(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    found: Anatomy,
+    effort: dict[str, float],
+) -> tuple[float, float]:
+    """How far back and ahead ankles hold the centre of mass with half of their effort.
+
+    [m] along x; each leg bears half of the weight.
+    """
+    weight = 9.81 * float(model.body_subtreemass[found.base])
+    low, high = -np.inf, np.inf
+    for chain in (c for n, c in found.limbs.items() if n.endswith("leg")):
+        for j in chain.joints[chain.bend + 1 :]:
+            torque = ANKLE_SHARE * effort[model.joint(j).name]
+            reach = torque / (0.5 * weight * max(abs(float(data.xaxis[j, 1])), 1e-9))
+            x = float(data.xanchor[j, 0])
+            low, high = max(low, x - reach), min(high, x + reach)
+    return low, high
 
 
 def _foot(
@@ -875,10 +926,9 @@ def _gains(
             "ki": _two_digits(ki),
         }
     }
-    largest = max(effort.values())
     drives, impedance = {}, {}
     for j in _moving(found):
-        weak = effort[model.joint(j).name] < WEAK * largest
+        weak = effort[model.joint(j).name] < WEAK * mass * 9.81 * height
         if weak:
             gains[model.joint(j).name] = {
                 "kp": _two_digits(WEAK_KP * kp),

@@ -24,6 +24,7 @@ from clamber.posture.keyframe import (
     KeyframeOptions,
     KeyframeTask,
     finish,
+    weakness,
 )
 from clamber.scene import GROUND
 from clamber.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
@@ -338,6 +339,9 @@ def _best_margin(
 ) -> Path | str:
     """The path with the largest of `MARGINS` for which there is one, or why not."""
     move = step.move
+    if key.status is Status.OVERLOADED:
+        ik.kin.update(key.q)
+        return f"{move}: {weakness(ik.kin, key.stance)}"
     if key.status is not Status.SOLVED:
         return f"{move}: {key.status.value}"
     reason = ""
@@ -347,7 +351,7 @@ def _best_margin(
         )
         lap("transitions")
         if transition.status is not Status.SOLVED:
-            reason = f"{move}: {transition.status.value}"
+            reason = f"{move}: {transition.note or transition.status.value}"
             continue
         path = plan_path(ik, transition)
         lap("paths")

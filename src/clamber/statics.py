@@ -21,6 +21,7 @@ from typing import Literal
 import daqp
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import linprog
 
 GRAVITY = 9.81  # [m/s^2]
 MAX_CONTACT_ANGLE = math.radians(25.0)  # found by experiment in the thesis
@@ -637,6 +638,51 @@ def static_equilibrium(
         forces=held.forces,
         torques=None if torque is None else torque.torques(held.forces),
     )
+
+
+def strength_needed(
+    points: np.ndarray,
+    normals: np.ndarray,
+    mu: np.ndarray,
+    com: np.ndarray,
+    mass: float,
+    *,
+    torque: TorqueLimits,
+    cone_edges: int = CONE_EDGES,
+) -> tuple[float, int] | None:
+    """How many times as strong all joints would have to be, and which one limits that.
+
+    The least s for which forces within the friction cones balance the weight with joint
+    torques |tau| <= s limits: an LP. At most 1 where the posture holds.
+
+    Args:
+        points: (nc, 3) [m].
+        normals: (nc, 3) unit normals out of the supports.
+        mu: (nc,) friction coefficients, positive.
+        com: (3,) centre of mass [m].
+        mass: [kg].
+        torque: What the joints bear.
+        cone_edges: m of the pyramids inside the cones.
+
+    Returns:
+        s, and the index into `torque.names`; None where no strength would do.
+    """
+    if len(points) == 0:
+        return None
+    lp = _build_push_lp(points, normals, mu, com, mass, cone_edges, torque)
+    limits = np.concatenate([torque.limits, torque.limits]) / (mass * GRAVITY)
+    n = lp.A_eq.shape[1] - 2
+    found = linprog(
+        np.append(np.zeros(n), 1.0),
+        A_ub=np.column_stack([lp.A_ub[:, :n], -limits]),
+        b_ub=lp.b_ub - limits,
+        A_eq=np.column_stack([lp.A_eq[:, :n], np.zeros(6)]),
+        b_eq=lp.b_eq,
+    )
+    if found.status != 0:
+        return None
+    price = np.abs(found.ineqlin.marginals) * limits
+    return float(found.fun), int(np.argmax(price)) % len(torque.names)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -27,7 +27,13 @@ from clamber.posture.ik import (
     contact_clearance,
     support_rotation,
 )
-from clamber.posture.keyframe import CLEARANCE, Keyframe, held_goal, holds
+from clamber.posture.keyframe import (
+    CLEARANCE,
+    Keyframe,
+    held_goal,
+    holds,
+    weakness,
+)
 
 REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
 MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
@@ -53,6 +59,7 @@ class Transition:
         margin: Of the centre of mass to the border of its polygon, throughout [m].
         status: Of the worst of its postures, with its residuals; OVERLOADED where the
             contacts that stay and the joints cannot hold one of them.
+        note: Which joint cannot.
     """
 
     move: Move
@@ -67,6 +74,7 @@ class Transition:
     iterations: int
     status: Status
     residuals: Residuals
+    note: str = ""
 
     @property
     def leaving(self) -> tuple[Contact, ...]:
@@ -206,11 +214,11 @@ def plan_transition(
             solutions.append(touch)
             touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
-    status = worst.status
+    status, note = worst.status, ""
     for s in solutions if status is Status.SOLVED else ():
         ik.kin.update(s.q)
         if not holds(ik.kin, held):
-            status = Status.OVERLOADED
+            status, note = Status.OVERLOADED, weakness(ik.kin, held)
     return Transition(
         move=move,
         before=before.q,
@@ -223,6 +231,7 @@ def plan_transition(
         margin=margin,
         iterations=sum(s.iterations for s in solutions),
         status=status,
+        note=note,
         residuals=worst.residuals,
     )
 

@@ -42,6 +42,7 @@ from clamber.statics import (
     contact_phase,
     projected_distance,
     static_equilibrium,
+    strength_needed,
     theta_max,
 )
 
@@ -280,6 +281,24 @@ def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
     com, mass = kin.com.copy(), kin.world.mass
     found = contact_forces(points, normals, mu, com, mass, torque=torque)
     return found.residual <= BALANCE_TOL
+
+
+def weakness(kin: Kinematics, contacts: tuple[Contact, ...]) -> str:
+    """Which joint is too weak where contacts do not hold the present posture."""
+    names, points, normals, mu = bearing_frames(kin, contacts)
+    torque = torque_limits(kin, names, points)
+    needed = strength_needed(
+        points, normals, mu, kin.com.copy(), kin.world.mass, torque=torque
+    )
+    if needed is None:
+        return f"{Status.OVERLOADED.value}, however strong its joints"
+    share, j = needed
+    counted = float(torque.limits[j])
+    return (
+        f"{Status.OVERLOADED.value}: {torque.names[j]} would have to bear"
+        f" {share * counted:.1f} N m; {counted:.1f} of its"
+        f" {float(kin.world.tau_max[j]):g} are counted on"
+    )
 
 
 def holding_limits(world: World, bearing: np.ndarray) -> np.ndarray:
