@@ -588,7 +588,7 @@ def _sole(
     points = link_points(model, data, end, below=True)
     if len(points) < 4:
         raise InputError(
-            f"geometry that MuJoCo loads ({', '.join(MESHES)}), for its sole",
+            f"geometry, meshes of {', '.join(MESHES)} included, for its sole",
             source=source,
             field=f"body {model.body(end).name!r}",
         )
