@@ -135,6 +135,9 @@ def _placed(root: ElementTree.Element, path: Path) -> tuple[np.ndarray, np.ndarr
         for child in list(parent):
             if child.tag.rpartition("}")[2] in _BESIDE:
                 parent.remove(child)
+        numbers = (parent.text or "") if parent.tag.endswith("float_array") else ""
+        if "nan" in numbers.lower():  # zero to the library
+            raise InputError("a mesh of finite numbers", source=path)
     with warnings.catch_warnings():
         # What is no number would end a list of numbers, with a warning.
         warnings.filterwarnings("error", message=".*string or file could not be read")
@@ -164,9 +167,12 @@ def _placed(root: ElementTree.Element, path: Path) -> tuple[np.ndarray, np.ndarr
                 shape = shape.triangleset()
             if not isinstance(shape, TriangleSet) or shape.vertex is None:
                 continue  # lines
-            triangles += len(shape.vertex_index)
+            index = shape.vertex_index
+            if index.min(initial=0) < 0:
+                raise InputError("indices of vertices from 0", source=path)
+            triangles += len(index)
             if triangles > MAX_TRIANGLES:
                 raise InputError(f"at most {MAX_TRIANGLES} triangles", source=path)
             local = shape.vertex.astype(float) @ X_WN[:3, :3].T + X_WN[:3, 3]
-            corners.append(unit * local[shape.vertex_index])
+            corners.append(unit * local[index])
     return np.concatenate(corners), _UPRIGHT[asset.upaxis or "Y_UP"]

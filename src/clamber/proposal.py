@@ -67,6 +67,7 @@ WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
 MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
 COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
 HAND_SHARE = 0.25  # of the weight, that a hand bears for ankles to position themselves
+ROUNDING = 1e-6  # share of a moment of inertia
 GUESSED_EFFORT = {"leg": 0.8, "trunk": 0.6, "arm": 0.25}  # of weight times thigh
 _EFFORTS = pydantic.TypeAdapter(dict[str, Annotated[float, pydantic.Field(gt=0)]])
 
@@ -1023,6 +1024,10 @@ def _add_inertia(
         R, r = data.ximat[b].reshape(3, 3), data.xipos[b] - centre
         I += R @ np.diag(model.body_inertia[b]) @ R.T
         I += m * (float(r @ r) * np.eye(3) - np.outer(r, r))
+    # The largest moment of a body is no more than the two others together, also when
+    # written in nine digits.
+    moments = np.linalg.eigvalsh(I)
+    I += max(moments[2] * (1 + ROUNDING) - moments[0] - moments[1], 0.0) * np.eye(3)
     R = data.xmat[link].reshape(3, 3)
     I = R.T @ I @ R
     ElementTree.SubElement(
