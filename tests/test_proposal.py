@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -236,6 +237,40 @@ def test_what_is_no_humanoid_is_refused(tmp_path):
     )
     with pytest.raises(InputError, match="two legs and two arms"):
         propose_robot(path)
+
+
+def test_links_around_a_ball_joint_are_not_kept_apart(tmp_path):
+    # 5 mm between pelvis and thigh, with three hinges between them.
+    text = humanoids.urdf().replace('<sphere radius="0.07"/>', '<sphere radius="0.025"/>')
+    apart = text.replace("0 0.08 0", "0 0.1 0").replace("0 -0.08 0", "0 -0.1 0")
+    along = text.replace(
+        '<origin xyz="0 0 0"/><axis xyz="0 1 0"/><limit lower="-1.9"',
+        '<origin xyz="0 0 -0.03"/><axis xyz="0 1 0"/><limit lower="-1.9"',
+    )
+    assert along != text != apart
+    kept = {}
+    for name, t in (("met", text), ("apart", apart), ("along", along)):
+        root = ElementTree.fromstring(
+            propose_robot(described(tmp_path, "urdf", t)).mjcf
+        )
+        pairs = {(e.get("body1"), e.get("body2")) for e in root.iter("exclude")}
+        kept[name] = ("k0", "p2") not in pairs and ("k0", "q2") not in pairs
+    assert kept == {"met": False, "apart": True, "along": True}
+
+
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 2.0, 3.0)])
+def test_a_flat_body_keeps_a_valid_inertia_when_written(tmp_path, moments):
+    text = humanoids.urdf()
+    a, b = text.index("<inertia "), text.index("/>", text.index("<inertia "))
+    x, y, z = (1e-2 * np.array(moments) / 3.0).tolist()
+    flat = f'<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"'
+    proposal = propose_robot(
+        described(tmp_path, "urdf", text[:a] + flat + text[b:])
+    )
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    np.testing.assert_allclose(
+        sorted(model.body("k0").inertia), sorted([x, y, z]), rtol=1e-5
+    )
 
 
 def test_a_link_without_geometry_gets_some_and_a_note(tmp_path):

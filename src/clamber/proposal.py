@@ -913,8 +913,9 @@ def _overlaps(
 ) -> list[tuple[str, str]]:
     """Names of links that overlap in the nominal posture, neighbours aside.
 
-    Links two joints apart, as in a hip, count when they are nearer than `TOUCHING`:
-    they are built around each other, and the shapes stand for more than is there.
+    Links two joints apart, as in a hip, and those that turn about one point, a ball
+    joint of three hinges, count when they are nearer than `TOUCHING`: they are built
+    around each other, and the shapes stand for more than is there.
     """
     text = _mjcf("trial", model, found, shapes, [], {})
     trial = mujoco.MjModel.from_xml_string(text)
@@ -930,10 +931,23 @@ def _overlaps(
             if i == j or parent[j] == i or (i, j) in out:
                 continue
             close = parent[parent[j]] == i or parent[i] == parent[j]
+            close = close or _about_one_point(trial, data, i, j)
             room = TOUCHING if close else 0.0
             if mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto) <= room:
                 out.add((i, j))
     return [(trial.body(i).name, trial.body(j).name) for i, j in sorted(out)]
+
+
+def _about_one_point(
+    model: mujoco.MjModel, data: mujoco.MjData, body: int, below: int
+) -> bool:
+    """Whether the axes of all joints between a body and one below it nearly meet."""
+    points = []
+    while below > body:
+        first = int(model.body_jntadr[below])
+        points += list(data.xanchor[first : first + int(model.body_jntnum[below])])
+        below = int(model.body_parentid[below])
+    return below == body and float(np.ptp(points, axis=0).max()) < TOUCHING
 
 
 def _numbers(x: Sequence[float] | np.ndarray) -> str:
