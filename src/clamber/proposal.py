@@ -547,11 +547,16 @@ def _joint_ball(
     chain: Chain,
     shapes: Sequence[Shape],
 ) -> Shape:
-    """A ball around knee or elbow that holds all of its link on the near side."""
-    link = int(links_of(model)[chain.middle])
+    """A ball around knee or elbow that holds all of the limb past it, on the near side.
+
+    The forearm may be a link of its own, that turns past the elbow.
+    """
+    links = links_of(model)
+    link = int(links[chain.middle])
+    past = {int(links[model.jnt_bodyid[j]]) for j in chain.joints[chain.bend :]}
     anchor = data.xanchor[chain.joints[chain.bend]]
     axis = data.xaxis[chain.joints[chain.bend]]
-    points = _points_of(shapes, [link], data)
+    points = _points_of(shapes, sorted(past), data)
     length = float(np.linalg.norm(data.xpos[chain.root] - anchor))
     on = _far(model, data, chain) - anchor
     on /= max(float(np.linalg.norm(on)), 1e-9)
