@@ -8,14 +8,18 @@ import sys
 import time
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
+import humanoids
+from clamber.description import compile_description, read_description
 from clamber.errors import InputError
 from clamber.mesh_files import read_mesh
+from clamber.proposal import propose_robot
 from test_description import CUBE, stl
 
 QUADS = [
@@ -143,7 +147,7 @@ def test_nodes_place_what_they_hold_from_the_outside_in(tmp_path):
     nodes = '<node id="n"><scale>2 1 1</scale><instance_geometry url="#g"/></node>'
     scene = (
         "<node><translate>1 2 3</translate><rotate>0 0 1 90</rotate>"
-        '<node><matrix>1 0 0 0.5  0 1 0 0  0 0 1 0  0 0 0 1</matrix>'
+        "<node><matrix>1 0 0 0.5  0 1 0 0  0 0 1 0  0 0 0 1</matrix>"
         '<instance_node url="#n"/></node></node>'
         f"<node>{SHOW}</node>"
     )
@@ -285,9 +289,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
 )
 def test_whatever_a_file_holds_it_is_a_mesh_or_our_own_error(tmp_path, name, data):
     good = (GOOD if name == "m.dae" else text_stl()).encode()
-    at = sorted(
-        data.draw(st.lists(st.integers(0, len(good)), min_size=2, max_size=6))
-    )
+    at = sorted(data.draw(st.lists(st.integers(0, len(good)), min_size=2, max_size=6)))
     parts = [good[a:b] for a, b in itertools.pairwise([0, *at, len(good)])]
     which = data.draw(st.integers(0, len(parts) - 1))
     parts[which] = data.draw(
@@ -295,7 +297,9 @@ def test_whatever_a_file_holds_it_is_a_mesh_or_our_own_error(tmp_path, name, dat
             st.just(b""),
             st.just(2 * parts[which]),
             st.binary(max_size=20),
-            st.sampled_from([b"-1", b"1e999", b"99999999999", b"<node>", b"#a", b"nan"]),
+            st.sampled_from(
+                [b"-1", b"1e999", b"99999999999", b"<node>", b"#a", b"nan"]
+            ),
         )
     )
     try:
@@ -306,6 +310,118 @@ def test_whatever_a_file_holds_it_is_a_mesh_or_our_own_error(tmp_path, name, dat
     if mesh is not None:
         assert np.isfinite(mesh.vertices).all()
         assert 0 <= mesh.triangles.min() <= mesh.triangles.max() < len(mesh.vertices)
+
+
+# In a robot.
+
+FORMS = {"t.stl": stl(CUBE), "u.stl": text_stl().encode(), "v.dae": GOOD.encode()}
+
+
+def drawn(folder: Path, name: str, content: bytes) -> mujoco.MjModel:
+    (folder / name).write_bytes(content)
+    path = folder / "robot.urdf"
+    path.write_text(humanoids.urdf(mesh=f'{name}" scale="1 -2 0.5'))
+    return compile_description(read_description(path), path)
+
+
+def test_a_robot_is_the_same_whatever_its_meshes_are_written_in(tmp_path):
+    corners = []
+    for name, content in FORMS.items():
+        model = drawn(tmp_path, name, content)
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        (geom,) = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
+        R, p = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+        corners.append(sorted((model.mesh_vert @ R.T + p).round(5).tolist()))
+    np.testing.assert_allclose(corners[1], corners[0], atol=1e-5)
+    np.testing.assert_allclose(corners[2], corners[0], atol=1e-5)
+    assert np.ptp(corners[0], axis=0) == pytest.approx([0.1, 0.2, 0.05], abs=1e-5)
+
+
+def test_a_mesh_read_here_goes_into_the_scene_and_not_beside_the_robot(tmp_path):
+    folder = tmp_path / "robot"
+    folder.mkdir()
+    drawn(folder, "v.dae", FORMS["v.dae"])
+    spec = read_description(folder / "robot.urdf").spec
+    spec.compile()
+    model = mujoco.MjModel.from_xml_string(spec.to_xml())
+    assert model.nmesh == 1
+    assert sorted(p.name for p in folder.iterdir()) == ["robot.urdf", "v.dae"]
+
+
+def test_a_broken_mesh_of_a_robot_is_named(tmp_path):
+    for name in ("v.dae", "u.stl"):
+        with pytest.raises(InputError, match=name):
+            drawn(tmp_path, name, FORMS[name][:400].rstrip(b"-0123456789. \n"))
+
+
+def long_along(axis: int) -> np.ndarray:
+    """Corners of a bar of 0.3 m that begins at the origin."""
+    size = np.full(3, 0.04)
+    size[axis] = 0.3
+    corners = 10 * CUBE - np.where(np.arange(3) == axis, 0, 0.5)
+    return corners * size
+
+
+@pytest.mark.parametrize(
+    ("tag", "axis", "heeded"),
+    [
+        ("Y_UP", 2, False),  # written for tools that ignore the tag
+        ("Y_UP", 1, True),  # ... and for those that turn y to z
+        ("X_UP", 0, True),
+        ("Z_UP", 2, False),
+        ("Y_UP", 0, False),  # does not fit either way: as it is
+    ],
+)
+def test_joints_tell_whether_the_up_axis_counts(tmp_path, tag, axis, heeded):
+    points = long_along(axis)
+    text = dae(points=points, asset=f"<up_axis>{tag}</up_axis>")
+    (tmp_path / "bar.dae").write_text(text)
+    inertial = (
+        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0"'
+        ' ixz="0" iyz="0"/></inertial>'
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        f'<robot name="arm"><link name="a">{inertial}<collision><geometry>'
+        '<mesh filename="bar.dae"/></geometry></collision></link>'
+        f'<link name="b">{inertial}</link><joint name="j" type="revolute">'
+        '<origin xyz="0 0 0.3"/><parent link="a"/><child link="b"/>'
+        '<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/>'
+        "</joint></robot>"
+    )
+    description = read_description(path)
+    (mesh,) = description.spec.meshes
+    vertices = np.reshape(mesh.uservert, (-1, 3))
+    if heeded:
+        assert [0, 0.3] == pytest.approx([vertices[:, 2].min(), vertices[:, 2].max()])
+    else:
+        np.testing.assert_allclose(
+            sorted(vertices.tolist()), sorted(points.tolist()), atol=1e-6
+        )
+    assert any("up axis" in n for n in description.notes) is heeded
+
+
+def test_feet_and_hands_are_found_in_meshes_of_any_form(tmp_path):
+    """A robot whose feet are meshes is proposed as one whose feet are boxes."""
+    box = '<box size="0.17 0.08 0.02"/>'
+    corners = (10 * CUBE - 0.5) * [0.17, 0.08, 0.02]
+    soles = []
+    for name, content in (
+        ("", b""),
+        ("foot.dae", dae(points=corners).encode()),
+        ("foot.stl", text_stl(corners).encode()),
+    ):
+        text = humanoids.urdf()
+        if name:
+            (tmp_path / name).write_bytes(content)
+            text = text.replace(box, f'<mesh filename="{name}"/>')
+        path = tmp_path / "small.urdf"
+        path.write_text(text)
+        model = mujoco.MjModel.from_xml_string(propose_robot(path).mjcf)
+        soles.append([model.geom(f).size.tolist() for f in ("LFoot", "RFoot")])
+    np.testing.assert_allclose(soles[1], soles[0], atol=1e-5)
+    np.testing.assert_allclose(soles[2], soles[0], atol=1e-5)
 
 
 def test_the_library_is_imported_only_where_there_is_such_a_mesh():

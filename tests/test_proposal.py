@@ -241,7 +241,9 @@ def test_what_is_no_humanoid_is_refused(tmp_path):
 
 def test_links_around_a_ball_joint_are_not_kept_apart(tmp_path):
     # 5 mm between pelvis and thigh, with three hinges between them.
-    text = humanoids.urdf().replace('<sphere radius="0.07"/>', '<sphere radius="0.025"/>')
+    text = humanoids.urdf().replace(
+        '<sphere radius="0.07"/>', '<sphere radius="0.025"/>'
+    )
     apart = text.replace("0 0.08 0", "0 0.1 0").replace("0 -0.08 0", "0 -0.1 0")
     along = text.replace(
         '<origin xyz="0 0 0"/><axis xyz="0 1 0"/><limit lower="-1.9"',
@@ -264,9 +266,7 @@ def test_a_flat_body_keeps_a_valid_inertia_when_written(tmp_path, moments):
     a, b = text.index("<inertia "), text.index("/>", text.index("<inertia "))
     x, y, z = (1e-2 * np.array(moments) / 3.0).tolist()
     flat = f'<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"'
-    proposal = propose_robot(
-        described(tmp_path, "urdf", text[:a] + flat + text[b:])
-    )
+    proposal = propose_robot(described(tmp_path, "urdf", text[:a] + flat + text[b:]))
     model = mujoco.MjModel.from_xml_string(proposal.mjcf)
     np.testing.assert_allclose(
         sorted(model.body("k0").inertia), sorted([x, y, z]), rtol=1e-5

@@ -101,7 +101,9 @@ def _read_text_stl(path: Path) -> np.ndarray:
     try:
         corners = np.array(found, dtype=bytes).astype(float)
     except ValueError as e:
-        raise InputError(f"an STL with three numbers a vertex ({e})", source=path) from e
+        raise InputError(
+            f"an STL with three numbers a vertex ({e})", source=path
+        ) from e
     if len(corners) % 3 or not len(corners):
         raise InputError(
             "an STL with three vertices a triangle",
