@@ -227,7 +227,7 @@ GOOD = dae()
         (dae(triangles([(0, 1, 8)])), "COLLADA"),
         (dae(triangles([(0, 1, -1)])), "from 0"),
         (dae(points=np.full((8, 3), np.nan)), "finite"),
-        (dae(points=CUBE.tolist()[:-1] + [["x", 0, 0]]), "COLLADA"),
+        (dae(points=[*CUBE.tolist()[:-1], ["x", 0, 0]]), "COLLADA"),
         (dae(LINES), "triangles"),
         (dae(triangles([(0, 0, 1)])), "triangles"),
         (dae(scene=""), "triangles"),
@@ -304,8 +304,7 @@ def test_whatever_a_file_holds_it_is_a_mesh_or_our_own_error(tmp_path, name, dat
     )
     try:
         mesh = read(tmp_path, b"".join(parts), name)
-    except InputError as e:
-        assert name in str(e)
+    except InputError:
         return
     if mesh is not None:
         assert np.isfinite(mesh.vertices).all()

@@ -162,9 +162,9 @@ def _take_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
 def _fits_upright(spec: mujoco.MjSpec, meshes: Mapping[str, MeshFile]) -> bool:
     """Whether a description expects that the up axis of COLLADA files is heeded.
 
-    RViz, Gazebo and Pinocchio ignore it, Bullet heeds it, and people write for what they
-    use. The joints of a link tell: they are within its meshes or near them. Sums up
-    how far each is from the box around each mesh, with the axis ignored and heeded.
+    RViz and Gazebo ignore it, Bullet heeds it, and people write for what they use. The
+    joints of a link tell: they are within its meshes or near them. Sums up how far
+    each is from the box around each mesh, with the axis ignored and heeded.
     """
     off = np.zeros(2)
     for geom in spec.geoms:

@@ -147,6 +147,7 @@ def _placed(root: ElementTree.Element, path: Path) -> tuple[np.ndarray, np.ndarr
     if document.scene is None:
         raise InputError("COLLADA with a scene", source=path)
     asset = document.assetInfo
+    assert asset is not None  # a document without has an empty one
     unit = 1.0 if asset.unitmeter is None else float(asset.unitmeter)
     if not 0 < unit < np.inf:
         raise InputError(
