@@ -239,6 +239,38 @@ def test_what_is_no_humanoid_is_refused(tmp_path):
         propose_robot(path)
 
 
+def test_an_elbow_lets_a_forearm_of_its_own_lie_flat(tmp_path):
+    """The forearm turns past the elbow and hangs behind the elbow's axis."""
+    text = humanoids.urdf()
+    for s in ("p", "q"):
+        # Between elbow and forearm comes a link; the forearm is 3 cm behind the axis.
+        text = text.replace(
+            f'<joint name="{s}9j" type="revolute"><parent link="{s}a2"/>'
+            f'<child link="{s}a3"/>',
+            f'<link name="{s}e"><inertial><mass value="0.2"/><inertia ixx="1e-4"'
+            ' iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            f'<joint name="{s}tw" type="revolute"><parent link="{s}e"/><child'
+            f' link="{s}a3"/><origin xyz="-0.03 0 0"/><axis xyz="0 0 1"/>'
+            '<limit lower="-1" upper="1" effort="5" velocity="5"/></joint>'
+            f'<joint name="{s}9j" type="revolute"><parent link="{s}a2"/>'
+            f'<child link="{s}e"/>',
+        )
+    proposal = propose_robot(described(tmp_path, "urdf", text))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    data = mujoco.MjData(model)
+    for s in "pq":
+        data.joint(f"{s}9j").qpos = -np.pi / 2  # the forearm points ahead
+    mujoco.mj_kinematics(model, data)
+    for s, side in (("p", "L"), ("q", "R")):
+        elbow, forearm = model.geom(f"{side}Elbow"), model.body(f"{s}a3")
+        g = int(forearm.geomadr[0])
+        assert model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CYLINDER
+        lowest = float(data.geom_xpos[g, 2] - model.geom_size[g, 0])
+        bottom = float(data.geom(elbow.id).xpos[2] - elbow.size[0])
+        assert lowest - 0.01 < bottom < lowest
+        assert elbow.bodyid[0] == model.body(f"{s}e").id
+
+
 def test_links_around_a_ball_joint_are_not_kept_apart(tmp_path):
     # 5 mm between pelvis and thigh, with three hinges between them.
     text = humanoids.urdf().replace(

@@ -549,7 +549,9 @@ def _joint_ball(
 ) -> Shape:
     """A ball around knee or elbow that holds all of the limb past it, on the near side.
 
-    The forearm may be a link of its own, that turns past the elbow.
+    The forearm may be a link of its own, that turns past the elbow and is no part of
+    the surface. Then the ball reaches as far as it away from where the limb folds: the
+    forearm comes to lie flat.
     """
     links = links_of(model)
     link = int(links[chain.middle])
@@ -559,7 +561,8 @@ def _joint_ball(
     points = _points_of(shapes, sorted(past), data)
     length = float(np.linalg.norm(data.xpos[chain.root] - anchor))
     on = _far(model, data, chain) - anchor
-    on /= max(float(np.linalg.norm(on)), 1e-9)
+    reach = max(float(np.linalg.norm(on)), 1e-9)
+    on /= reach
     near = points[(points - anchor) @ on < NEAR * length]
     middle, radius = np.zeros(3), LEAST_BALL * length
     if len(near):
@@ -567,6 +570,10 @@ def _joint_ball(
         middle = 0.5 * (aside.max() + aside.min()) * axis
         radius = float(np.linalg.norm(near - anchor - middle, axis=1).max())
     radius = float(np.clip(radius, LEAST_BALL * length, LARGEST_BALL * length))
+    beneath = -chain.sign * np.cross(axis, on)
+    others = _points_of(shapes, sorted(past - {link}), data) - anchor
+    depth = (others[others @ on < 0.5 * reach] @ beneath).max(initial=radius)
+    middle = middle + (depth - radius) * beneath
     p, _ = _in_link(data, link, anchor + middle, np.eye(3))
     return _shape(name, link, "sphere", (radius + PAD,), p, np.eye(3), surface=True)
 
