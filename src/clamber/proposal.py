@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import textwrap
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 from xml.etree import ElementTree
@@ -51,6 +51,8 @@ SOLE_DEPTH = 0.04  # share of the shank: points this near to the lowest are the 
 NEAR = 0.05  # share of thigh or upper arm: as far past the joint its ball holds all
 LEAST_BALL, LARGEST_BALL = 0.12, 0.3  # ... radius at knee and elbow
 TOUCHING = 0.02  # [m] links two joints apart that are nearer are not kept apart
+ROOM = 0.01  # [m] around links as the robot stands
+THINNER = 0.2  # share of its size
 KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
@@ -154,6 +156,9 @@ def propose_robot(
             "links that overlap, or nearly, in the nominal posture are not kept apart: "
             + ", ".join(f"{a} and {b}" for a, b in overlaps)
         )
+    shapes, thin = _thinned(model, found, shapes, home, overlaps)
+    if thin:
+        notes.append(f"thinner, for room beside other links: {', '.join(thin)}")
     gains, drives, impedance = _gains(model, data, found, effort)
     bears = _hand_load(model, data, found, shapes, effort)
     ankles = []
@@ -920,14 +925,13 @@ def _gains(
 # Writing.
 
 
-def _overlaps(
+def _near(
     model: mujoco.MjModel, found: Anatomy, shapes: list[Shape], home: dict[str, float]
-) -> list[tuple[str, str]]:
-    """Names of links that overlap in the nominal posture, neighbours aside.
+) -> Iterator[tuple[str, str, str, str, float, bool]]:
+    """Pairs of links, their shapes, how far apart these are as the robot stands [m].
 
-    Links two joints apart, as in a hip, and those that turn about one point, a ball
-    joint of three hinges, count when they are nearer than `TOUCHING`: they are built
-    around each other, and the shapes stand for more than is there.
+    Of neighbours none, of others those nearer than `TOUCHING`; and whether two joints
+    are between the links.
     """
     text = _mjcf("trial", model, found, shapes, [], {})
     trial = mujoco.MjModel.from_xml_string(text)
@@ -935,31 +939,62 @@ def _overlaps(
     for name, angle in home.items():
         data.qpos[trial.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(trial, data)
-    parent = trial.body_parentid
-    out, fromto = set(), np.zeros(6)
+    parent, fromto = trial.body_parentid, np.zeros(6)
     for a in range(trial.ngeom):
         for b in range(a + 1, trial.ngeom):
             i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
-            if i == j or parent[j] == i or (i, j) in out:
+            if i == j or parent[j] == i:
                 continue
-            close = parent[parent[j]] == i or parent[i] == parent[j]
-            close = close or _about_one_point(trial, data, i, j)
-            room = TOUCHING if close else 0.0
-            if mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto) <= room:
-                out.add((i, j))
-    return [(trial.body(i).name, trial.body(j).name) for i, j in sorted(out)]
+            d = mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto)
+            if d < TOUCHING:
+                links, names = (trial.body(i).name, trial.body(j).name), (a, b)
+                two = parent[parent[j]] == i or parent[i] == parent[j]
+                yield (*links, *(trial.geom(g).name for g in names), d, bool(two))
 
 
-def _about_one_point(
-    model: mujoco.MjModel, data: mujoco.MjData, body: int, below: int
-) -> bool:
-    """Whether the axes of all joints between a body and one below it nearly meet."""
-    points = []
-    while below > body:
-        first = int(model.body_jntadr[below])
-        points += list(data.xanchor[first : first + int(model.body_jntnum[below])])
-        below = int(model.body_parentid[below])
-    return below == body and float(np.ptp(points, axis=0).max()) < TOUCHING
+def _overlaps(
+    model: mujoco.MjModel, found: Anatomy, shapes: list[Shape], home: dict[str, float]
+) -> list[tuple[str, str]]:
+    """Names of links that overlap in the nominal posture, neighbours aside.
+
+    Links two joints apart, as in a hip, count when they are nearer than `TOUCHING`:
+    they are built around each other, and the shapes stand for more than is there.
+    """
+    out = {
+        (i, j): None
+        for i, j, _, _, d, two in _near(model, found, shapes, home)
+        if two or d <= 0.0
+    }
+    return list(out)
+
+
+def _thinned(
+    model: mujoco.MjModel,
+    found: Anatomy,
+    shapes: list[Shape],
+    home: dict[str, float],
+    apart: Sequence[tuple[str, str]],
+) -> tuple[list[Shape], list[str]]:
+    """Shapes with `ROOM` around them in the nominal posture, and names of the thinned.
+
+    Links that pass each other by less are built to; whoever plans keeps that room. What
+    is no surface gives way, by `THINNER` of its size at most.
+    """
+    fixed = {s.name for s in shapes if s.surface}
+    lack: dict[str, float] = {}
+    for i, j, a, b, d, _ in _near(model, found, shapes, home):
+        gives = [n for n in (a, b) if n not in fixed]
+        if (i, j) in apart or d >= ROOM:
+            continue
+        for n in gives:
+            lack[n] = max(lack.get(n, 0.0), (ROOM - d) / len(gives))
+    out = []
+    for s in shapes:
+        n = len(s.size) if s.kind != "capsule" else 1
+        less = min(lack.get(s.name, 0.0), THINNER * min(s.size[:n]))
+        size = tuple(x - less if k < n else x for k, x in enumerate(s.size))
+        out.append(replace(s, size=size))
+    return out, sorted(lack)
 
 
 def _numbers(x: Sequence[float] | np.ndarray) -> str:
