@@ -270,6 +270,26 @@ def test_an_elbow_lets_a_forearm_of_its_own_lie_flat(tmp_path):
         assert elbow.bodyid[0] == model.body(f"{s}e").id
 
 
+@pytest.mark.parametrize(
+    ("radius", "thinner"), [(0.018, 0.0), (0.025, 0.0025), (0.031, None)]
+)
+def test_links_that_pass_closely_get_the_room_that_planning_keeps(
+    tmp_path, radius, thinner
+):
+    """Between pelvis and thighs, three joints apart, are 0.03 m less the pelvis."""
+    text = humanoids.urdf().replace('radius="0.07"', f'radius="{radius}"')
+    proposal = propose_robot(described(tmp_path, "urdf", text))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    pelvis, thigh = (
+        model.geom(int(model.body(b).geomadr[0])).size[0] for b in ("k0", "p2")
+    )
+    if thinner is None:  # they overlap: not kept apart, and as they are
+        assert any("not kept apart: k0 and p2" in n for n in proposal.notes)
+    assert pelvis == pytest.approx(radius - (thinner or 0.0), abs=1e-5)
+    assert thigh == pytest.approx(0.05 - (thinner or 0.0), abs=1e-5)
+    assert any("thinner" in n for n in proposal.notes) is bool(thinner)
+
+
 @pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 2.0, 3.0)])
 def test_a_flat_body_keeps_a_valid_inertia_when_written(tmp_path, moments):
     text = humanoids.urdf()
