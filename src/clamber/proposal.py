@@ -55,6 +55,8 @@ ROOM = 0.01  # [m] around links as the robot stands
 THINNER = 0.2  # share of its size
 KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
+LESS_BENT = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # ... or less, where an ankle limits it
+LEVEL = 2e-3  # [rad] of soles
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
 LIMIT_ROOM = 0.05  # [rad] that the nominal posture keeps from joint limits
@@ -722,14 +724,17 @@ def _solve_leg(
     zero: tuple[np.ndarray, np.ndarray],
     ahead: float,
 ) -> None:
+    """Put a leg's angles into `q`: the foot level, the knee bent as far as that lets."""
     data = mujoco.MjData(model)
     knee = chain.joints[chain.bend]
     low, high = joint_range(model, knee)
     room = (high if chain.sign > 0 else -low) * KNEE_SHARE
     free = [j for j in chain.joints if j != knee]
     address = model.jnt_qposadr[free]
-    q[model.jnt_qposadr[knee]] = chain.sign * min(KNEE_BEND, room)
     lo, hi = _bounds(model, free)
+
+    def tilt(R: np.ndarray) -> np.ndarray:
+        return rotation_vector(R @ zero[1].T)
 
     def error(x: np.ndarray) -> np.ndarray:
         data.qpos[:] = q
@@ -737,9 +742,16 @@ def _solve_leg(
         mujoco.mj_kinematics(model, data)
         middle, R = _foot(model, data, chain)
         place = 10.0 * (middle[:2] - zero[0][:2] - [ahead, 0.0])
-        return np.concatenate([place, 5.0 * rotation_vector(R @ zero[1].T), 0.01 * x])
+        return np.concatenate([place, 5.0 * tilt(R), 0.01 * x])
 
-    q[address] = least_squares(error, np.clip(q[address], lo, hi), bounds=(lo, hi)).x
+    start = np.clip(q[address], lo, hi)
+    for less in LESS_BENT:
+        q[model.jnt_qposadr[knee]] = less * chain.sign * min(KNEE_BEND, room)
+        x = least_squares(error, start, bounds=(lo, hi)).x
+        error(x)
+        if np.linalg.norm(tilt(_foot(model, data, chain)[1])) < LEVEL:
+            break
+    q[address] = x
 
 
 def _solve_arm(model: mujoco.MjModel, q: np.ndarray, chain: Chain, side: float) -> None:
