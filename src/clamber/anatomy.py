@@ -120,8 +120,8 @@ def find_limbs(
     pairs = _paired(model, data, base, grips)
     if len(pairs) < 2:
         raise InputError(
-            "two legs and two arms, mirror images of each other at the zero posture, z up"
-            f" (found {len(pairs)} pairs of limbs with {LEAST_JOINTS} joints or more)",
+            "two legs and two arms, mirror images of each other at the zero posture, z"
+            f" up (found {len(pairs)} pairs of limbs with {LEAST_JOINTS} joints or more)",
             source=source,
             field="kinematic tree",
         )

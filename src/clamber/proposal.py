@@ -724,7 +724,7 @@ def _solve_leg(
     zero: tuple[np.ndarray, np.ndarray],
     ahead: float,
 ) -> None:
-    """Put a leg's angles into `q`: the foot level, the knee bent as far as that lets."""
+    """Put a leg's angles into `q`: foot level, the knee bent as far as that lets."""
     data = mujoco.MjData(model)
     knee = chain.joints[chain.bend]
     low, high = joint_range(model, knee)
