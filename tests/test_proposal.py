@@ -238,6 +238,19 @@ def test_what_is_no_humanoid_is_refused(tmp_path):
         propose_robot(path)
 
 
+@pytest.mark.parametrize(("limit", "bent"), [(0.9, 0.9), (0.43, 0.63)])
+def test_a_knee_bends_less_where_the_ankle_would_tilt_the_sole(tmp_path, limit, bent):
+    text = humanoids.urdf().replace(
+        '<limit lower="-0.9" upper="0.9" effort="60"',
+        f'<limit lower="-{limit}" upper="0.9" effort="60"',
+    )
+    proposal = propose_robot(described(tmp_path, "urdf", text))
+    home = proposal.fields["home"]
+    assert home["p3j"] == home["q3j"] == pytest.approx(bent, abs=1e-3)
+    assert home["p2j"] + home["p3j"] + home["p4j"] == pytest.approx(0, abs=2e-3)
+    assert home["p4j"] >= 0.05 - limit - 1e-9
+
+
 def test_an_elbow_lets_a_forearm_of_its_own_lie_flat(tmp_path):
     """The forearm turns past the elbow and hangs behind the elbow's axis."""
     text = humanoids.urdf()

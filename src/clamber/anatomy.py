@@ -121,7 +121,7 @@ def find_limbs(
     if len(pairs) < 2:
         raise InputError(
             "two legs and two arms, mirror images of each other at the zero posture, z"
-            f" up (found {len(pairs)} pairs of limbs with {LEAST_JOINTS} joints or more)",
+            f" up (found {len(pairs)} pairs of limbs of {LEAST_JOINTS} joints or more)",
             source=source,
             field="kinematic tree",
         )
