@@ -744,7 +744,7 @@ def _solve_leg(
         place = 10.0 * (middle[:2] - zero[0][:2] - [ahead, 0.0])
         return np.concatenate([place, 5.0 * tilt(R), 0.01 * x])
 
-    start = np.clip(q[address], lo, hi)
+    x = start = np.clip(q[address], lo, hi)
     for less in LESS_BENT:
         q[model.jnt_qposadr[knee]] = less * chain.sign * min(KNEE_BEND, room)
         x = least_squares(error, start, bounds=(lo, hi)).x
