@@ -274,6 +274,13 @@ def test_a_broken_text_stl_is_named(tmp_path, text, word):
     assert "m.stl" in str(e.value)
 
 
+def test_a_file_that_cannot_be_read_is_named(tmp_path):
+    for name in ("m.dae", "m.stl"):
+        (tmp_path / name).mkdir()
+        with pytest.raises(InputError, match=name):
+            read_mesh(tmp_path / name)
+
+
 def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr("clamber.markup.MAX_BYTES", len(GOOD) - 1)
     with pytest.raises(InputError, match="at most"):

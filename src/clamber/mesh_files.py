@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from clamber.errors import InputError
+from clamber.errors import InputError, unreadable
 from clamber.markup import read_content, read_xml
 
 COLLADA, STL = ".dae", ".stl"
@@ -59,7 +59,8 @@ def read_mesh(path: Path) -> MeshFile | None:
     """The triangles of a file; None: MuJoCo loads it itself.
 
     Raises:
-        InputError: It is a COLLADA file or an STL in text, and broken or too large.
+        InputError: It cannot be read, or is COLLADA or STL in text, and broken or too
+            large.
     """
     suffix, upright = path.suffix.lower(), np.eye(3)
     if suffix == COLLADA:
@@ -86,12 +87,14 @@ def read_mesh(path: Path) -> MeshFile | None:
 
 def _is_text(path: Path) -> bool:
     """Whether an STL is text: a binary one may begin with the same word."""
-    with path.open("rb") as f:
-        head = f.read(STL_HEAD)
-    faces = int.from_bytes(head[80:84], "little")
-    binary = len(head) == STL_HEAD and (
-        path.stat().st_size == STL_HEAD + STL_FACE * faces
-    )
+    try:
+        with path.open("rb") as f:
+            head = f.read(STL_HEAD)
+        size = path.stat().st_size
+    except OSError as e:
+        raise unreadable(path, e) from e
+    faces = int.from_bytes(head[80:], "little")
+    binary = len(head) == STL_HEAD and size == STL_HEAD + STL_FACE * faces
     return head.lstrip().startswith(b"solid") and not binary
 
 

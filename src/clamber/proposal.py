@@ -959,9 +959,9 @@ def _near(
                 continue
             d = mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto)
             if d < TOUCHING:
-                links, names = (trial.body(i).name, trial.body(j).name), (a, b)
+                p, q = trial.body(i).name, trial.body(j).name
                 two = parent[parent[j]] == i or parent[i] == parent[j]
-                yield (*links, *(trial.geom(g).name for g in names), d, bool(two))
+                yield p, q, trial.geom(a).name, trial.geom(b).name, d, bool(two)
 
 
 def _overlaps(
@@ -985,7 +985,7 @@ def _thinned(
     found: Anatomy,
     shapes: list[Shape],
     home: dict[str, float],
-    apart: Sequence[tuple[str, str]],
+    overlaps: Sequence[tuple[str, str]],
 ) -> tuple[list[Shape], list[str]]:
     """Shapes with `ROOM` around them in the nominal posture, and names of the thinned.
 
@@ -996,7 +996,7 @@ def _thinned(
     lack: dict[str, float] = {}
     for i, j, a, b, d, _ in _near(model, found, shapes, home):
         gives = [n for n in (a, b) if n not in fixed]
-        if (i, j) in apart or d >= ROOM:
+        if (i, j) in overlaps or d >= ROOM:
             continue
         for n in gives:
             lack[n] = max(lack.get(n, 0.0), (ROOM - d) / len(gives))
