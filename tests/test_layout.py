@@ -22,6 +22,8 @@ SOURCE = ROOT / "src" / "clamber"
 LAYERS = [
     "errors",
     "se3",
+    "markup",
+    "mesh_files",
     "description",
     "boxes",
     "scene",

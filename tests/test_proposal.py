@@ -248,6 +248,84 @@ def test_a_refusal_says_which_limbs_there_are_and_what_else_moves(tmp_path):
         propose_robot(described(tmp_path, "mjcf", text))
 
 
+@pytest.mark.parametrize(("limit", "bent"), [(0.9, 0.9), (0.43, 0.63)])
+def test_a_knee_bends_less_where_the_ankle_would_tilt_the_sole(tmp_path, limit, bent):
+    text = humanoids.urdf().replace(
+        '<limit lower="-0.9" upper="0.9" effort="60"',
+        f'<limit lower="-{limit}" upper="0.9" effort="60"',
+    )
+    proposal = propose_robot(described(tmp_path, "urdf", text))
+    home = proposal.fields["home"]
+    assert home["p3j"] == home["q3j"] == pytest.approx(bent, abs=1e-3)
+    assert home["p2j"] + home["p3j"] + home["p4j"] == pytest.approx(0, abs=2e-3)
+    assert home["p4j"] >= 0.05 - limit - 1e-9
+
+
+def test_an_elbow_lets_a_forearm_of_its_own_lie_flat(tmp_path):
+    """The forearm turns past the elbow and hangs behind the elbow's axis."""
+    text = humanoids.urdf()
+    for s in ("p", "q"):
+        # Between elbow and forearm comes a link; the forearm is 3 cm behind the axis.
+        text = text.replace(
+            f'<joint name="{s}9j" type="revolute"><parent link="{s}a2"/>'
+            f'<child link="{s}a3"/>',
+            f'<link name="{s}e"><inertial><mass value="0.2"/><inertia ixx="1e-4"'
+            ' iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            f'<joint name="{s}tw" type="revolute"><parent link="{s}e"/><child'
+            f' link="{s}a3"/><origin xyz="-0.03 0 0"/><axis xyz="0 0 1"/>'
+            '<limit lower="-1" upper="1" effort="5" velocity="5"/></joint>'
+            f'<joint name="{s}9j" type="revolute"><parent link="{s}a2"/>'
+            f'<child link="{s}e"/>',
+        )
+    proposal = propose_robot(described(tmp_path, "urdf", text))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    data = mujoco.MjData(model)
+    for s in "pq":
+        data.joint(f"{s}9j").qpos = -np.pi / 2  # the forearm points ahead
+    mujoco.mj_kinematics(model, data)
+    for s, side in (("p", "L"), ("q", "R")):
+        elbow, forearm = model.geom(f"{side}Elbow"), model.body(f"{s}a3")
+        g = int(forearm.geomadr[0])
+        assert model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CYLINDER
+        lowest = float(data.geom_xpos[g, 2] - model.geom_size[g, 0])
+        bottom = float(data.geom(elbow.id).xpos[2] - elbow.size[0])
+        assert lowest - 0.01 < bottom < lowest
+        assert elbow.bodyid[0] == model.body(f"{s}e").id
+
+
+@pytest.mark.parametrize(
+    ("radius", "thinner"), [(0.018, 0.0), (0.025, 0.0025), (0.031, None)]
+)
+def test_links_that_pass_closely_get_the_room_that_planning_keeps(
+    tmp_path, radius, thinner
+):
+    """Between pelvis and thighs, three joints apart, are 0.03 m less the pelvis."""
+    text = humanoids.urdf().replace('radius="0.07"', f'radius="{radius}"')
+    proposal = propose_robot(described(tmp_path, "urdf", text))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    pelvis, thigh = (
+        model.geom(int(model.body(b).geomadr[0])).size[0] for b in ("k0", "p2")
+    )
+    if thinner is None:  # they overlap: not kept apart, and as they are
+        assert any("not kept apart: k0 and p2" in n for n in proposal.notes)
+    assert pelvis == pytest.approx(radius - (thinner or 0.0), abs=1e-5)
+    assert thigh == pytest.approx(0.05 - (thinner or 0.0), abs=1e-5)
+    assert any("thinner" in n for n in proposal.notes) is bool(thinner)
+
+
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 2.0, 3.0)])
+def test_a_flat_body_keeps_a_valid_inertia_when_written(tmp_path, moments):
+    text = humanoids.urdf()
+    a, b = text.index("<inertia "), text.index("/>", text.index("<inertia "))
+    x, y, z = (1e-2 * np.array(moments) / 3.0).tolist()
+    flat = f'<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"'
+    proposal = propose_robot(described(tmp_path, "urdf", text[:a] + flat + text[b:]))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    np.testing.assert_allclose(
+        sorted(model.body("k0").inertia), sorted([x, y, z]), rtol=1e-5
+    )
+
+
 def test_a_link_without_geometry_gets_some_and_a_note(tmp_path):
     text = humanoids.mjcf()
     first = text.index('<geom type="capsule"', text.index('name="t2"'))

@@ -122,8 +122,8 @@ def find_limbs(
     pairs = _paired(model, data, base, grips)
     if len(pairs) < 2:
         raise InputError(
-            "two legs and two arms, mirror images of each other at the zero posture, of"
-            f" {LEAST_JOINTS} joints or more ({_found(model, pairs)})",
+            "two legs and two arms, mirror images of each other at the zero posture, z"
+            f" up, of {LEAST_JOINTS} joints or more ({_found(model, pairs)})",
             source=source,
             field="kinematic tree",
         )

@@ -1,14 +1,14 @@
 """MJCF or URDF file -> MuJoCo's spec, read with care.
 
-What a description names is looked for and only read; nothing is written. A document
-type could hold entities that expand without end or pull in files: it is refused. A
-URDF's `package://` meshes are found beside the file and in `ROS_PACKAGE_PATH`.
+What a description names is looked for and only read; nothing is written. A URDF's
+`package://` meshes are found beside the file and in `ROS_PACKAGE_PATH`; those that
+MuJoCo does not load become part of the spec.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,10 +16,13 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError, unreadable
+from clamber.errors import InputError
+from clamber.markup import read_xml
+from clamber.mesh_files import COLLADA, MeshFile, read_mesh
+from clamber.se3 import matrix_from_quat
 
-MAX_BYTES = 50_000_000  # of a description
-MESHES = (".stl", ".obj", ".msh")  # what MuJoCo loads
+MESHES = (".stl", ".obj", ".msh", COLLADA)
+CLEARLY = 0.5  # times as far, and no farther, are joints from what is theirs
 WATER = 1000.0  # [kg/m^3]
 LEAST_INERTIA = 1e-9  # [kg m^2]
 PACKAGE = "package://"
@@ -46,13 +49,13 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
 
     Args:
         path: The file.
-        lenient: Mend with a note what would be an error: leave out meshes of formats
-            that MuJoCo does not load, give links without a proper inertia a small one.
+        lenient: Mend with a note what would be an error: leave out meshes of unknown
+            formats, give links without a proper inertia a small one.
 
     Raises:
-        InputError: It cannot be read, is no such file, or a mesh is missing.
+        InputError: It cannot be read, is no such file, or a mesh is missing or broken.
     """
-    root = _parse(path)
+    root = read_xml(path)
     notes: list[str] = []
     try:
         if root.tag == "robot":
@@ -66,6 +69,7 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
             _keep_all(root)
             text = ElementTree.tostring(root, encoding="unicode")
             spec = mujoco.MjSpec.from_string(text)
+            _take_meshes(spec, notes)
         elif root.tag in ("mujoco", "mujocoinclude"):
             spec = mujoco.MjSpec.from_file(str(path))
             mimics = {
@@ -102,29 +106,6 @@ def _one_line(e: Exception) -> str:
     return " ".join(str(e).split())
 
 
-def _parse(path: Path) -> ElementTree.Element:
-    try:
-        content = path.read_bytes()
-    except OSError as e:
-        raise unreadable(path, e) from e
-    if len(content) > MAX_BYTES:
-        raise InputError(
-            f"at most {MAX_BYTES // 1_000_000} MB", source=path, value=len(content)
-        )
-    if b"\0" in content:  # UTF-16 would hide what is looked for next
-        raise InputError("XML in UTF-8", source=path)
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise InputError(
-            "XML without a document type: entities are not expanded",
-            source=path,
-            field="<!DOCTYPE>",
-        )
-    try:
-        return ElementTree.fromstring(content)
-    except ElementTree.ParseError as e:
-        raise InputError(f"XML ({e})", source=path) from e
-
-
 def _resolve_meshes(
     root: ElementTree.Element, path: Path, lenient: bool, notes: list[str]
 ) -> None:
@@ -146,7 +127,7 @@ def _resolve_meshes(
                             value=name,
                         )
                     link.remove(shape)
-                    notes.append(f"{where} {name} is left out: MuJoCo cannot load it")
+                    notes.append(f"{where} {name} is left out: no known format")
                     continue
                 found = next((p for p in _places(name, path) if p.is_file()), None)
                 if found is None:
@@ -158,6 +139,46 @@ def _resolve_meshes(
                         value=name,
                     )
                 mesh.set("filename", str(found.resolve()))
+
+
+def _take_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Put the triangles of files that MuJoCo does not load into the spec."""
+    read = {m.name: read_mesh(Path(m.file)) for m in spec.meshes}
+    found = {n: m for n, m in read.items() if m is not None}
+    upright = _fits_upright(spec, found)
+    if upright:
+        notes.append(
+            "the up axis of its COLLADA meshes is heeded: ignored, as RViz does, they"
+            " do not reach their joints"
+        )
+    for mesh in spec.meshes:
+        if mesh.name in found:
+            file = found[mesh.name]
+            vertices = file.vertices @ file.upright.T if upright else file.vertices
+            mesh.file = ""
+            mesh.uservert, mesh.userface = vertices.ravel(), file.triangles.ravel()
+
+
+def _fits_upright(spec: mujoco.MjSpec, meshes: Mapping[str, MeshFile]) -> bool:
+    """Whether a description expects that the up axis of COLLADA files is heeded.
+
+    RViz and Gazebo ignore it, Bullet heeds it, and people write for what they use. The
+    joints of a link tell: they are within its meshes or near them. Sums up how far
+    each is from the box around each mesh, with the axis ignored and heeded.
+    """
+    off = np.zeros(2)
+    for geom in spec.geoms:
+        file = meshes.get(geom.meshname)
+        if file is None:
+            continue
+        scale, R = spec.mesh(geom.meshname).scale, matrix_from_quat(geom.quat)
+        for i, turn in enumerate((np.eye(3), file.upright)):
+            vertices = file.vertices @ turn.T * scale
+            for child in geom.parent.bodies:
+                p = R.T @ (child.pos - geom.pos)
+                beside = np.maximum(vertices.min(axis=0) - p, p - vertices.max(axis=0))
+                off[i] += float(np.linalg.norm(np.maximum(beside, 0.0)))
+    return bool(off[1] < CLEARLY * off[0])
 
 
 def _check_inertia(

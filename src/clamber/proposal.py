@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import textwrap
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 from xml.etree import ElementTree
@@ -53,8 +53,12 @@ SOLE_DEPTH = 0.04  # share of the shank: points this near to the lowest are the 
 NEAR = 0.05  # share of thigh or upper arm: as far past the joint its ball holds all
 LEAST_BALL, LARGEST_BALL = 0.12, 0.3  # ... radius at knee and elbow
 TOUCHING = 0.02  # [m] links two joints apart that are nearer are not kept apart
+ROOM = 0.01  # [m] around links as the robot stands
+THINNER = 0.2  # share of its size
 KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
+LESS_BENT = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # ... or less, where an ankle limits it
+LEVEL = 2e-3  # [rad] of soles
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
 ANKLE_SHARE = 0.5  # of the ankles' effort, at most, that the nominal posture asks for
@@ -70,6 +74,7 @@ WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
 MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
 COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
 HAND_SHARE = 0.25  # of the weight, that a hand bears for ankles to position themselves
+ROUNDING = 1e-6  # share of a moment of inertia
 GUESSED_EFFORT = {"leg": 0.8, "trunk": 0.6, "arm": 0.25}  # of weight times thigh
 _EFFORTS = pydantic.TypeAdapter(dict[str, Annotated[float, pydantic.Field(gt=0)]])
 
@@ -156,6 +161,9 @@ def propose_robot(
             "links that overlap, or nearly, in the nominal posture are not kept apart: "
             + ", ".join(f"{a} and {b}" for a, b in overlaps)
         )
+    shapes, thin = _thinned(model, found, shapes, home, overlaps)
+    if thin:
+        notes.append(f"thinner, for room beside other links: {', '.join(thin)}")
     gains, drives, impedance = _gains(model, data, found, effort)
     bears = _hand_load(model, data, found, shapes, effort)
     ankles = []
@@ -574,14 +582,22 @@ def _joint_ball(
     chain: Chain,
     shapes: Sequence[Shape],
 ) -> Shape:
-    """A ball around knee or elbow that holds all of its link on the near side."""
-    link = int(links_of(model)[chain.middle])
+    """A ball around knee or elbow that holds all of the limb past it, on the near side.
+
+    The forearm may be a link of its own, that turns past the elbow and is no part of
+    the surface. Then the ball reaches as far as it away from where the limb folds: the
+    forearm comes to lie flat.
+    """
+    links = links_of(model)
+    link = int(links[chain.middle])
+    past = {int(links[model.jnt_bodyid[j]]) for j in chain.joints[chain.bend :]}
     anchor = data.xanchor[chain.joints[chain.bend]]
     axis = data.xaxis[chain.joints[chain.bend]]
-    points = _points_of(shapes, [link], data)
+    points = _points_of(shapes, sorted(past), data)
     length = float(np.linalg.norm(data.xpos[chain.root] - anchor))
     on = _far(model, data, chain) - anchor
-    on /= max(float(np.linalg.norm(on)), 1e-9)
+    reach = max(float(np.linalg.norm(on)), 1e-9)
+    on /= reach
     near = points[(points - anchor) @ on < NEAR * length]
     middle, radius = np.zeros(3), LEAST_BALL * length
     if len(near):
@@ -589,6 +605,10 @@ def _joint_ball(
         middle = 0.5 * (aside.max() + aside.min()) * axis
         radius = float(np.linalg.norm(near - anchor - middle, axis=1).max())
     radius = float(np.clip(radius, LEAST_BALL * length, LARGEST_BALL * length))
+    beneath = -chain.sign * np.cross(axis, on)
+    others = _points_of(shapes, sorted(past - {link}), data) - anchor
+    depth = (others[others @ on < 0.5 * reach] @ beneath).max(initial=radius)
+    middle = middle + (depth - radius) * beneath
     p, _ = _in_link(data, link, anchor + middle, np.eye(3))
     return _shape(name, link, "sphere", (radius + PAD,), p, np.eye(3), surface=True)
 
@@ -616,7 +636,7 @@ def _sole(
     points = link_points(model, data, end, below=True)
     if len(points) < 4:
         raise InputError(
-            f"geometry that MuJoCo loads ({', '.join(MESHES)}), for its sole",
+            f"geometry, meshes of {', '.join(MESHES)} included, for its sole",
             source=source,
             field=f"body {model.body(end).name!r}",
         )
@@ -755,14 +775,17 @@ def _solve_leg(
     zero: tuple[np.ndarray, np.ndarray],
     ahead: float,
 ) -> None:
+    """Put a leg's angles into `q`: foot level, the knee bent as far as that lets."""
     data = mujoco.MjData(model)
     knee = chain.joints[chain.bend]
     low, high = joint_range(model, knee)
     room = (high if chain.sign > 0 else -low) * KNEE_SHARE
     free = [j for j in chain.joints if j != knee]
     address = model.jnt_qposadr[free]
-    q[model.jnt_qposadr[knee]] = chain.sign * min(KNEE_BEND, room)
     lo, hi = _bounds(model, free)
+
+    def tilt(R: np.ndarray) -> np.ndarray:
+        return rotation_vector(R @ zero[1].T)
 
     def error(x: np.ndarray) -> np.ndarray:
         data.qpos[:] = q
@@ -770,9 +793,16 @@ def _solve_leg(
         mujoco.mj_kinematics(model, data)
         middle, R = _foot(model, data, chain)
         place = 10.0 * (middle[:2] - zero[0][:2] - [ahead, 0.0])
-        return np.concatenate([place, 5.0 * rotation_vector(R @ zero[1].T), 0.01 * x])
+        return np.concatenate([place, 5.0 * tilt(R), 0.01 * x])
 
-    q[address] = least_squares(error, np.clip(q[address], lo, hi), bounds=(lo, hi)).x
+    x = start = np.clip(q[address], lo, hi)
+    for less in LESS_BENT:
+        q[model.jnt_qposadr[knee]] = less * chain.sign * min(KNEE_BEND, room)
+        x = least_squares(error, start, bounds=(lo, hi)).x
+        error(x)
+        if np.linalg.norm(tilt(_foot(model, data, chain)[1])) < LEVEL:
+            break
+    q[address] = x
 
 
 def _solve_arm(model: mujoco.MjModel, q: np.ndarray, chain: Chain, side: float) -> None:
@@ -957,6 +987,33 @@ def _gains(
 # Writing.
 
 
+def _near(
+    model: mujoco.MjModel, found: Anatomy, shapes: list[Shape], home: dict[str, float]
+) -> Iterator[tuple[str, str, str, str, float, bool]]:
+    """Pairs of links, their shapes, how far apart these are as the robot stands [m].
+
+    Of neighbours none, of others those nearer than `TOUCHING`; and whether two joints
+    are between the links.
+    """
+    text = _mjcf("trial", model, found, shapes, [], {})
+    trial = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(trial)
+    for name, angle in home.items():
+        data.qpos[trial.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(trial, data)
+    parent, fromto = trial.body_parentid, np.zeros(6)
+    for a in range(trial.ngeom):
+        for b in range(a + 1, trial.ngeom):
+            i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
+            if i == j or parent[j] == i:
+                continue
+            d = mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto)
+            if d < TOUCHING:
+                p, q = trial.body(i).name, trial.body(j).name
+                two = parent[parent[j]] == i or parent[i] == parent[j]
+                yield p, q, trial.geom(a).name, trial.geom(b).name, d, bool(two)
+
+
 def _overlaps(
     model: mujoco.MjModel, found: Anatomy, shapes: list[Shape], home: dict[str, float]
 ) -> list[tuple[str, str]]:
@@ -965,24 +1022,41 @@ def _overlaps(
     Links two joints apart, as in a hip, count when they are nearer than `TOUCHING`:
     they are built around each other, and the shapes stand for more than is there.
     """
-    text = _mjcf("trial", model, found, shapes, [], {})
-    trial = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(trial)
-    for name, angle in home.items():
-        data.qpos[trial.joint(name).qposadr[0]] = angle
-    mujoco.mj_kinematics(trial, data)
-    parent = trial.body_parentid
-    out, fromto = set(), np.zeros(6)
-    for a in range(trial.ngeom):
-        for b in range(a + 1, trial.ngeom):
-            i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
-            if i == j or parent[j] == i or (i, j) in out:
-                continue
-            close = parent[parent[j]] == i or parent[i] == parent[j]
-            room = TOUCHING if close else 0.0
-            if mujoco.mj_geomDistance(trial, data, a, b, 1.0, fromto) <= room:
-                out.add((i, j))
-    return [(trial.body(i).name, trial.body(j).name) for i, j in sorted(out)]
+    out = {
+        (i, j): None
+        for i, j, _, _, d, two in _near(model, found, shapes, home)
+        if two or d <= 0.0
+    }
+    return list(out)
+
+
+def _thinned(
+    model: mujoco.MjModel,
+    found: Anatomy,
+    shapes: list[Shape],
+    home: dict[str, float],
+    overlaps: Sequence[tuple[str, str]],
+) -> tuple[list[Shape], list[str]]:
+    """Shapes with `ROOM` around them in the nominal posture, and names of the thinned.
+
+    Links that pass each other by less are built to; whoever plans keeps that room. What
+    is no surface gives way, by `THINNER` of its size at most.
+    """
+    fixed = {s.name for s in shapes if s.surface}
+    lack: dict[str, float] = {}
+    for i, j, a, b, d, _ in _near(model, found, shapes, home):
+        gives = [n for n in (a, b) if n not in fixed]
+        if (i, j) in overlaps or d >= ROOM:
+            continue
+        for n in gives:
+            lack[n] = max(lack.get(n, 0.0), (ROOM - d) / len(gives))
+    out = []
+    for s in shapes:
+        n = len(s.size) if s.kind != "capsule" else 1
+        less = min(lack.get(s.name, 0.0), THINNER * min(s.size[:n]))
+        size = tuple(x - less if k < n else x for k, x in enumerate(s.size))
+        out.append(replace(s, size=size))
+    return out, sorted(lack)
 
 
 def _numbers(x: Sequence[float] | np.ndarray) -> str:
@@ -1073,6 +1147,10 @@ def _add_inertia(
         R, r = data.ximat[b].reshape(3, 3), data.xipos[b] - centre
         I += R @ np.diag(model.body_inertia[b]) @ R.T
         I += m * (float(r @ r) * np.eye(3) - np.outer(r, r))
+    # The largest moment of a body is no more than the two others together, also when
+    # written in nine digits.
+    moments = np.linalg.eigvalsh(I)
+    I += max(moments[2] * (1 + ROUNDING) - moments[0] - moments[1], 0.0) * np.eye(3)
     R = data.xmat[link].reshape(3, 3)
     I = R.T @ I @ R
     ElementTree.SubElement(
