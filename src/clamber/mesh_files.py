@@ -179,6 +179,7 @@ def _placed(root: ElementTree.Element, path: Path) -> tuple[np.ndarray, np.ndarr
             triangles += len(index)
             if triangles > MAX_TRIANGLES:
                 raise InputError(f"at most {MAX_TRIANGLES} triangles", source=path)
-            local = shape.vertex.astype(float) @ X_WN[:3, :3].T + X_WN[:3, 3]
-            corners.append(unit * local[index])
+            with np.errstate(all="ignore"):  # what is not finite is refused later
+                local = shape.vertex.astype(float) @ X_WN[:3, :3].T + X_WN[:3, 3]
+                corners.append(unit * local[index])
     return np.concatenate(corners), _UPRIGHT[asset.upaxis or "Y_UP"]
