@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from clamber.balance import HIGH, LOW, MOST, SMOOTHING, Balance
+from clamber.balance import FADE, HIGH, MOST, SAG, SMOOTHING, Balance
 from clamber.contact import Contact
 from clamber.model import Kinematics
 from clamber.pipeline import Plan
@@ -154,7 +154,8 @@ def test_the_integral_goes_on_up_to_its_bound(demo_plan, kin, kneeling):
 def test_it_sets_in_between_two_margins(demo_plan, kin, kneeling):
     """Nothing above the one, all of it below the other, and no jump."""
     sizes = []
-    for margin in (HIGH + 0.001, HIGH - 0.001, 0.5 * (HIGH + LOW), LOW, LOW - 0.001):
+    low = HIGH - FADE
+    for margin in (HIGH + 0.001, HIGH - 0.001, HIGH - 0.5 * FADE, low, low - 0.001):
         q, sagged, three, _ = endangered(demo_plan, kin, kneeling, margin)
         offset = answered(demo_plan, sagged, q, three, ticks=30)
         sizes.append(float(np.linalg.norm(shift_of(kin, q, offset, three)[0])))
@@ -162,6 +163,18 @@ def test_it_sets_in_between_two_margins(demo_plan, kin, kneeling):
     assert 0.0 < sizes[1] < 0.3 * sizes[2]
     assert 0.3 * sizes[4] < sizes[2] < 0.8 * sizes[4]
     assert sizes[3] == pytest.approx(sizes[4], rel=0.15)
+
+
+@pytest.mark.parametrize(("more", "acts"), [(0.9 * SAG, False), (1.5 * SAG, True)])
+def test_what_was_planned_near_the_border_is_let_alone(
+    demo_plan, kin, kneeling, more, acts
+):
+    """A narrow sole has no more: only what is lost of that is brought back."""
+    q, contacts = kneeling
+    three = narrow(kin, q, contacts)[-1]
+    q = at_margin(kin, q, three, 0.015)
+    sagged = at_margin(kin, q, three, 0.015 - more)
+    assert answered(demo_plan, sagged, q, three, ticks=30).any() == acts
 
 
 def test_where_the_robot_is_and_how_it_is_turned_does_not_matter(

@@ -2,8 +2,9 @@
 
 A plan's postures balance, but a compliant robot sags by some millimetres, and where the
 support is a narrow triangle that is all there is. Once the margin of the measured
-centre of mass falls below `HIGH`, its deviation e from the plan, seen from the contacts
-that bear, is fed back (with all weight w = 1 from `LOW` on):
+centre of mass falls below `HIGH`, and by `SAG` below the planned one, its deviation e
+from the plan, seen from the contacts, is fed back (with all its weight, w = 1, from
+`FADE` less on):
 
     s = -w (P e + D de/dt) - integral(w e / T dt),    |s| <= MOST,
 
@@ -24,7 +25,8 @@ from clamber.contact import Contact
 from clamber.model import Kinematics, World
 from clamber.statics import com_margin, support_polygon
 
-HIGH, LOW = 0.022, 0.014  # [m] margins between which feedback sets in
+HIGH, FADE = 0.022, 0.008  # [m] margin at which feedback sets in, and within how much
+SAG = 0.003  # [m] less than the planned margin is no danger
 P, D, T = 0.5, 0.1, 1.0  # gain; [s] of the rate; [s] of the integral
 MOST = 0.03  # [m]
 RATE_SMOOTHING = 0.03  # [s] time constant of the deviation
@@ -53,13 +55,13 @@ class Balance:
         Args:
             q: (nq,) as measured.
             reference: (nq,) as planned.
-            contacts: That bear load.
+            contacts: That the plan has closed; one without load gets it from leaning.
         """
         kin, dt = self._kin, self._period
         if not contacts:
             return
         now, points, margin = self._seen(q, contacts)
-        planned, places, _ = self._seen(reference, contacts)
+        planned, places, meant = self._seen(reference, contacts)
         # The contacts may be turned from where they were planned, all together.
         c = float(np.sum(points * places))
         s = float(np.sum(points[:, 0] * places[:, 1] - points[:, 1] * places[:, 0]))
@@ -69,7 +71,7 @@ class Balance:
         rate = (e - self._deviation) / (RATE_SMOOTHING + dt)
         self._deviation = self._deviation + dt * rate
         e = self._deviation
-        w = float(np.clip((HIGH - margin) / (HIGH - LOW), 0.0, 1.0))
+        w = float(np.clip((min(HIGH, meant - SAG) - margin) / FADE, 0.0, 1.0))
         # Where it is not needed it fades.
         self._integral -= dt / T * (w * e + (1.0 - w) * self._integral)
         shift = self._integral - w * (P * e + D * rate)

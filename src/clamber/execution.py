@@ -587,20 +587,16 @@ class Execution:
         if not self._slow:  # in faster motion the robot need not balance statically
             return self.reference
         if self._k % LOOK_STRIDE == 0:
-            self._balance.feel(self._pose, self.reference, self._bearing())
+            self._balance.feel(self._pose, self.reference, self._closed_contacts())
         q = self.reference.copy()
         q[self._qadr] += self._balance.offset(PHYSICS_STEP)
         return q
 
-    def _bearing(self) -> list[Contact]:
-        """Contacts that are closed by the plan and bear load."""
+    def _closed_contacts(self) -> list[Contact]:
+        """Those of the plan at present."""
         near = self._keyframes[self._leg : self._leg + 2]
         contacts = {c.surface: c for key in near for c in key.stance}
-        return [
-            c
-            for c in contacts.values()
-            if self._closed[self._surfaces.index(c.surface)] and self._force(c) >= LOST
-        ]
+        return [contacts[s] for s in contacts if self._closed[self._surfaces.index(s)]]
 
     def _struck(self) -> list[str]:
         """Surfaces, neither in contact nor about to be, that strike a side."""
