@@ -472,16 +472,16 @@ class Execution:
         held = tuple(x for x in stance if x.surface != c.surface)
         t = feeling(self._world, held, c, self._trajectory.q[self._i])
         self._left_plan = True
-        for i in range(0 if t is None else len(t.time)):
-            assert t is not None
+        if t is None:
+            return None
+        for i in range(len(t.time)):
             self._set(t, i)
             yield
             felt = c if self._touches(c, REACH) else self._other(c)
             if felt is not None:
                 self._velocity = np.zeros(len(self._dadr))
                 return felt
-        for i in reversed(range(0 if t is None else len(t.time))):
-            assert t is not None
+        for i in reversed(range(len(t.time))):
             self._set(t, i)
             self._velocity = -self._velocity
             yield
@@ -596,7 +596,8 @@ class Execution:
         """Those of the plan at present."""
         near = self._keyframes[self._leg : self._leg + 2]
         contacts = {c.surface: c for key in near for c in key.stance}
-        return [contacts[s] for s in contacts if self._closed[self._surfaces.index(s)]]
+        index = self._surfaces.index
+        return [c for s, c in contacts.items() if self._closed[index(s)]]
 
     def _struck(self) -> list[str]:
         """Surfaces, neither in contact nor about to be, that strike a side."""
