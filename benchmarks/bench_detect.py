@@ -8,8 +8,8 @@ import time
 
 import numpy as np
 
-from clamber.demo import ClimbOptions, synthesize_climb
-from clamber.detect import detect_contacts
+from clamber.recording.detect import detect_contacts
+from clamber.recording.synthetic import ClimbOptions, synthesize_climb
 
 DURATION = 25.0  # [s] of the recording
 USUAL = 21.5  # [s] of the built-in climb at its usual speed

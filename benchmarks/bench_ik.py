@@ -16,8 +16,10 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from clamber.model import World, build_world, load_robot
-from clamber.posture.ik import (
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene
+from clamber.model.world import World, build_world
+from clamber.step.ik import (
     IK,
     STEP_ROTATION,
     STEP_TRANSLATION,
@@ -26,7 +28,6 @@ from clamber.posture.ik import (
     base_clearance,
     contact_clearance,
 )
-from clamber.scene import Scene
 
 POSTURES = 300
 REPEATS = 20  # iterations from home, to see that all three solve the same problem

@@ -17,11 +17,12 @@ from typing import get_args
 
 import numpy as np
 
-from clamber.demo import load_demo
-from clamber.detect import detect_contacts
-from clamber.model import load_robot
-from clamber.pipeline import Method, Plan, PlanOptions, plan
-from clamber.scene import Scene
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene
+from clamber.planning.planner import plan
+from clamber.planning.records import Method, Plan, PlanOptions
+from clamber.recording.detect import detect_contacts
+from clamber.recording.library import load_demo
 
 
 def table(result: Plan) -> None:

@@ -12,11 +12,11 @@ import statistics
 import sys
 import time
 
-from clamber.demo import load_demo
-from clamber.detect import detect_contacts
-from clamber.model import load_robot
-from clamber.pipeline import plan
-from clamber.scene import Scene
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene
+from clamber.planning.planner import plan
+from clamber.recording.detect import detect_contacts
+from clamber.recording.library import load_demo
 
 HEIGHT = 0.275  # [m]
 REPEATS = 5

@@ -13,13 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from clamber.demo import (
-    Demonstration,
-    load_demo,
-    synthesize_climb,
-    write_c3d,
-    write_trc,
-)
+from clamber.recording.c3d import write_c3d
+from clamber.recording.demonstration import Demonstration
+from clamber.recording.library import load_demo
+from clamber.recording.synthetic import synthesize_climb
+from clamber.recording.trc import write_trc
 
 SECONDS, RATE, MARKERS = 600.0, 240.0, 60
 FORMATS = ("c3d", "trc", "csv", "bvh", "npz")

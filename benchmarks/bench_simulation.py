@@ -16,12 +16,13 @@ import time
 import mujoco
 import numpy as np
 
-from clamber.demo import load_demo
-from clamber.detect import detect_contacts
-from clamber.model import PHYSICS_STEP, load_robot
-from clamber.pipeline import plan
-from clamber.scene import Scene
-from clamber.simulation import judge, simulate
+from clamber.execution.simulation import judge, simulate
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene
+from clamber.model.world import PHYSICS_STEP
+from clamber.planning.planner import plan
+from clamber.recording.detect import detect_contacts
+from clamber.recording.library import load_demo
 
 HEIGHT = 0.275  # [m]
 REPEATS = 3

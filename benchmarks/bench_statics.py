@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from clamber.statics import (
+from clamber.step.statics import (
     com_margin,
     contact_forces,
     is_statically_stable,

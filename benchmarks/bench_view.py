@@ -31,8 +31,8 @@ import viser
 from playwright.sync_api import Browser, sync_playwright
 
 import clamber
-from clamber.view.page import FRAMES_A_SECOND
-from clamber.view.stage import LAYERS
+from clamber.show.view.page import FRAMES_A_SECOND
+from clamber.show.view.stage import LAYERS
 
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 SETTLED = 4.0  # [s] until shaders are compiled and the resolution has been adapted

@@ -14,7 +14,8 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from clamber.demo import Demonstration, load_demo
+from clamber.recording.demonstration import Demonstration
+from clamber.recording.library import load_demo
 
 BONES = [
     *((s + a, s + b) for s in "LR" for a, b in (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clamber.scene import Box, Scene
+from clamber.model.scene import Box, Scene
 
 ROOT = Path(__file__).parents[1]
 
@@ -87,7 +87,7 @@ DEMO_HEIGHT = 0.275  # [m] the box of the method's own experiments
 
 @pytest.fixture(scope="session")
 def coman():
-    from clamber.model import load_robot
+    from clamber.model.robot import load_robot
 
     return load_robot("coman")
 
@@ -95,16 +95,16 @@ def coman():
 @pytest.fixture(scope="session")
 def demo_sequence():
     """What is detected in the built-in climb, at the person's scale."""
-    from clamber.demo import load_demo
-    from clamber.detect import detect_contacts
+    from clamber.recording.detect import detect_contacts
+    from clamber.recording.library import load_demo
 
     return detect_contacts(load_demo("climb"))
 
 
 @pytest.fixture(scope="session")
 def demo_plan(demo_sequence, coman):
-    from clamber.pipeline import plan
-    from clamber.scene import Scene
+    from clamber.model.scene import Scene
+    from clamber.planning.planner import plan
 
     return plan(demo_sequence, coman, Scene.from_height(DEMO_HEIGHT))
 
@@ -114,7 +114,7 @@ def fast_plan(demo_plan):
     """The same postures, as fast as joints and contacts bear."""
     from dataclasses import replace
 
-    from clamber.pipeline import timed
+    from clamber.planning.planner import timed
 
     trajectory = timed(demo_plan.world, demo_plan.paths, "max")
     options = replace(demo_plan.options, speed="max")
@@ -126,7 +126,7 @@ def hands_plan(demo_plan):
     """Fast, and no more than the first two steps: both hands on the box."""
     from dataclasses import replace
 
-    from clamber.pipeline import timed
+    from clamber.planning.planner import timed
 
     paths, stances = demo_plan.paths[:2], demo_plan.sequence.stances
     down = [
@@ -152,8 +152,8 @@ def hands_plan(demo_plan):
 @pytest.fixture(scope="session")
 def demo_rollout(demo_plan):
     """Open loop, by sensors that know everything."""
-    from clamber.disturbance import Disturbance
-    from clamber.simulation import simulate
+    from clamber.execution.disturbance import Disturbance
+    from clamber.execution.simulation import simulate
 
     exact = Disturbance(noise=0.0, delay=0.0)
     return simulate(demo_plan, controller="pid", disturbance=exact)
@@ -162,7 +162,7 @@ def demo_rollout(demo_plan):
 @pytest.fixture(scope="session")
 def demo_kinematics(demo_plan):
     """A workspace of the planned world: every test updates it before it looks."""
-    from clamber.model import Kinematics
+    from clamber.model.kinematics import Kinematics
 
     return Kinematics(demo_plan.world)
 
@@ -172,7 +172,7 @@ def demo_kinematics(demo_plan):
 
 def contact(surface: str, support: str, x: float, y: float, z: float):
     """A contact that lies level and faces x."""
-    from clamber.contact import Contact
+    from clamber.contact.contact import Contact
 
     return Contact(
         surface=surface,
@@ -185,8 +185,8 @@ def contact(surface: str, support: str, x: float, y: float, z: float):
 @pytest.fixture(scope="session")
 def one_hand():
     """Standing, then the left hand on a box."""
-    from clamber.contact import ContactSequence, Stance
-    from clamber.scene import Scene
+    from clamber.contact.contact import ContactSequence, Stance
+    from clamber.model.scene import Scene
 
     feet = (
         contact("LFoot", "ground", 0.03, 0.07, 0.0),
@@ -205,7 +205,8 @@ def one_hand():
 @pytest.fixture(scope="session")
 def one_hand_plan(one_hand, coman):
     """That, planned at 1 rad/s."""
-    from clamber.pipeline import PlanOptions, plan
+    from clamber.planning.planner import plan
+    from clamber.planning.records import PlanOptions
 
     return plan(one_hand, coman, one_hand.scene, options=PlanOptions(speed=1.0))
 
@@ -213,7 +214,7 @@ def one_hand_plan(one_hand, coman):
 @pytest.fixture(scope="session")
 def one_hand_rollout(one_hand_plan):
     """And followed open loop."""
-    from clamber.simulation import simulate
+    from clamber.execution.simulation import simulate
 
     return simulate(one_hand_plan, controller="pid")
 
@@ -221,7 +222,7 @@ def one_hand_rollout(one_hand_plan):
 @pytest.fixture(scope="module")
 def ran(one_hand_plan, one_hand_rollout):
     """As the view shows it."""
-    from clamber.view.shown import show_run
+    from clamber.show.view.shown import show_run
 
     return show_run(one_hand_plan, one_hand_rollout)
 
@@ -229,7 +230,7 @@ def ran(one_hand_plan, one_hand_rollout):
 @pytest.fixture(scope="module")
 def planned(one_hand_plan):
     """Before it is run."""
-    from clamber.view.shown import show_run
+    from clamber.show.view.shown import show_run
 
     return show_run(one_hand_plan, None)
 
@@ -237,7 +238,8 @@ def planned(one_hand_plan):
 @pytest.fixture(scope="module")
 def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
     """The run folder of that motion; of the module alone, which may write in it."""
-    from clamber import io, judge
+    from clamber import judge
+    from clamber.run import folder as io
 
     folder = tmp_path_factory.mktemp("whole")
     io.save_plan(one_hand_plan, folder)

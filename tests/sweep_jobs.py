@@ -7,7 +7,7 @@ import os
 import time
 from pathlib import Path
 
-from clamber.job import Job, Outcome, command_of
+from clamber.study.climb import Job, Outcome, command_of
 
 LOG = "CLAMBER_TEST_LOG"  # names a folder: each job that begins leaves a file in it
 SECONDS = "CLAMBER_TEST_SECONDS"

@@ -6,7 +6,8 @@ import functools
 import sys
 
 import sweep_jobs
-from clamber import cli, sweep
+from clamber import cli
+from clamber.study import sweep
 
 if __name__ == "__main__":
     sweep.run_sweep = functools.partial(sweep.run_sweep, job=sweep_jobs.slow)

@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber import adaptation
-from clamber.adaptation import (
+from clamber.contact.steps import split_moves
+from clamber.errors import Status
+from clamber.model.kinematics import Kinematics
+from clamber.model.se3 import matrix_from_rpy
+from clamber.model.world import World, build_world
+from clamber.planning import adaptation
+from clamber.planning.adaptation import (
     FEELING_SPEED,
     FOLLOWED,
     REACH,
@@ -19,15 +24,11 @@ from clamber.adaptation import (
     go_on,
     start_again,
 )
-from clamber.errors import Status
-from clamber.model import Kinematics, World, build_world
-from clamber.moves import split_moves
-from clamber.pipeline import Midway
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import bearing_frames, contact_drift
-from clamber.se3 import matrix_from_rpy
-from clamber.statics import com_margin, support_polygon
-from clamber.trajectory import HOLD_START, RATE, holding_torque
+from clamber.planning.records import Midway
+from clamber.planning.trajectory import HOLD_START, RATE, holding_torque
+from clamber.step.ik import IK
+from clamber.step.posture import bearing_frames, contact_drift
+from clamber.step.statics import com_margin, support_polygon
 
 STEPS = range(6)
 OFFSETS = [(0.0, 0.0, 0.02), (0.0, 0.0, -0.03), (0.012, -0.01, 0.015)]
@@ -318,7 +319,7 @@ def test_a_stance_that_cannot_be_is_said_to_be_none(fast_plan):
 
 def test_a_step_that_has_no_way_is_named(fast_plan, monkeypatch):
     """The box has moved away: the rest of the climb is out of reach."""
-    monkeypatch.setattr("clamber.pipeline.VARIATIONS", ({},))
+    monkeypatch.setattr("clamber.planning.planner.VARIATIONS", ({},))
     key = fast_plan.keyframes[0]
     scene = moved_world(fast_plan.world, (3.0, 0.0, 0.0)).scene
     found = adapt_plan(fast_plan, scene, midway(0, key.stance, key.q), key.q)

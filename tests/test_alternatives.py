@@ -9,8 +9,20 @@ import numpy as np
 import pytest
 import yaml
 
-from clamber import alternatives, cli, search
-from clamber.alternatives import (
+from clamber import cli
+from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.contact.steps import Skipped, split_moves
+from clamber.errors import InputError
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.simulation import judge, simulate
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene
+from clamber.model.world import build_world
+from clamber.planning import search
+from clamber.planning import substitutes as alternatives
+from clamber.planning.free import Bounds, Explored, Stop
+from clamber.planning.substitutes import (
     Ranked,
     contact_alternatives,
     contact_differences,
@@ -22,15 +34,7 @@ from clamber.alternatives import (
     stand_ins,
     steps_made,
 )
-from clamber.contact import Contact, ContactSequence, Stance
-from clamber.disturbance import Disturbance
-from clamber.errors import InputError
-from clamber.exploration import Bounds, Explored, Stop
-from clamber.io import load_plan, load_state, save_plan, save_sequence
-from clamber.model import Kinematics, build_world, load_robot
-from clamber.moves import Skipped, split_moves
-from clamber.scene import Scene
-from clamber.simulation import judge, simulate
+from clamber.run.folder import load_plan, load_state, save_plan, save_sequence
 
 HANDS, ELBOWS = {"LHand", "RHand"}, {"LElbow", "RElbow"}
 

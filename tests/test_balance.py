@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from clamber.balance import FADE, HIGH, MOST, SAG, SMOOTHING, Balance
-from clamber.contact import Contact
-from clamber.model import Kinematics
-from clamber.pipeline import Plan
-from clamber.se3 import quat_from_matrix
-from clamber.statics import com_margin, support_polygon
+from clamber.contact.contact import Contact
+from clamber.execution.balance import FADE, HIGH, MOST, SAG, SMOOTHING, Balance
+from clamber.model.kinematics import Kinematics
+from clamber.model.se3 import quat_from_matrix
+from clamber.planning.records import Plan
+from clamber.step.statics import com_margin, support_polygon
 
 PERIOD = 0.01
 UP = np.array([0.0, 0.0, 1.0])

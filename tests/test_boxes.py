@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clamber.boxes import read_drawn_boxes
-from clamber.checkup import check_scene
 from clamber.errors import InputError
-from clamber.path import highest
-from clamber.scene import Box, Scene, load_scene
-from clamber.se3 import matrix_from_rpy
-from clamber.statics import contact_angle
+from clamber.model.scene import Box, Scene, load_scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.model.terrain import read_drawn_boxes
+from clamber.planning.diagnose import check_scene
+from clamber.step.path import highest
+from clamber.step.statics import contact_angle
 
 
 def obj(size, position, rpy, rng) -> str:
@@ -155,8 +155,8 @@ def test_the_angle_to_a_normal_is_that_to_the_vertical_turned(rng):
     "rpy", [(0, -0.1745, 0), (0, 0.1745, 0), (0.1745, 0, 0), (0, 0.3491, 0)]
 )
 def test_a_slope_is_climbed_in_physics(coman, demo_sequence, rpy):
-    from clamber.pipeline import plan
-    from clamber.simulation import judge, simulate
+    from clamber.execution.simulation import judge, simulate
+    from clamber.planning.planner import plan
 
     R, size = matrix_from_rpy(rpy), np.array([1.0, 1.2, 0.5])
     edge = R @ (size * [-0.5, 0.0, 0.5])

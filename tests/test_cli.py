@@ -17,7 +17,8 @@ import pytest
 from rich.console import Console
 
 import clamber
-from clamber import cli, terminal
+from clamber import cli
+from clamber.cli import output as terminal
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
@@ -49,7 +50,9 @@ def test_help_names_every_command_without_loading_the_planner():
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert time.perf_counter() - start < 10.0
     text, loaded = out.stdout.split("LOADED")
-    assert not {"mujoco", "numpy", "scipy", "clamber.pipeline"} & set(loaded.split())
+    assert not {"mujoco", "numpy", "scipy", "clamber.planning.planner"} & set(
+        loaded.split()
+    )
     for name in COMMANDS:
         assert name in text
 
@@ -176,7 +179,7 @@ def test_an_interrupt_is_one_sentence_and_exit_130(
 
 
 def test_the_flags_of_planning_are_fields_of_its_options():
-    from clamber.pipeline import Method, PlanOptions
+    from clamber.planning.records import Method, PlanOptions
 
     flags, options = cli.PlanningFlags(), PlanOptions()
     for f in fields(cli.PlanningFlags):
@@ -465,7 +468,7 @@ names: [LHand, RHand]
 
 def spoiled_robot(folder: Path) -> Path:
     """COMAN's files, the description naming a surface that the model has not."""
-    from clamber.model import ROBOTS
+    from clamber.model.robot import ROBOTS
 
     for p in (ROBOTS / "coman").iterdir():
         (folder / p.name).write_bytes(p.read_bytes())
@@ -509,8 +512,8 @@ def one_stance(folder: Path) -> Path:
     """A sequence that any scene with a box fits."""
     import numpy as np
 
-    from clamber.contact import Contact, ContactSequence, Stance
-    from clamber.scene import Scene
+    from clamber.contact.contact import Contact, ContactSequence, Stance
+    from clamber.model.scene import Scene
 
     def on(surface: str, support: str, x: float, z: float) -> Contact:
         y = 0.07 if surface[0] == "L" else -0.07
@@ -632,7 +635,7 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
 def quick_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The words of a sweep whose jobs are quick."""
     import sweep_jobs
-    from clamber import sweep
+    from clamber.study import sweep
 
     quick = functools.partial(sweep.run_sweep, job=sweep_jobs.breaks_at_friction)
     monkeypatch.setattr(sweep, "run_sweep", quick)
@@ -675,7 +678,7 @@ def test_a_sweep_that_is_interrupted_says_how_to_go_on(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    from clamber import sweep
+    from clamber.study import sweep
 
     def interrupt(*args: object, **more: object) -> None:
         raise KeyboardInterrupt

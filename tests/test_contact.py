@@ -5,8 +5,8 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
-from clamber.contact import Contact, ContactSequence, Stance, region_of
-from clamber.scene import Scene
+from clamber.contact.contact import Contact, ContactSequence, Stance, region_of
+from clamber.model.scene import Scene
 
 FLAT = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from clamber.contact import Contact, ContactSequence, Stance
-from clamber.contraction import (
+from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.contact.learn import (
     build_demo_policy,
     contract_policies,
     dominant_actions,
@@ -20,13 +20,14 @@ from clamber.contraction import (
     limb_of,
     pelvis_samples,
 )
-from clamber.demo import CrossingOptions, load_demo, synthesize_crossing
-from clamber.detect import detect_contacts
+from clamber.contact.policy import GeneralPolicy, pelvis_rotation, wrap
 from clamber.errors import InputError
-from clamber.io import load_sequence, save_sequence
-from clamber.policy import GeneralPolicy, pelvis_rotation, wrap
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from clamber.recording.crossing import CrossingOptions, synthesize_crossing
+from clamber.recording.detect import detect_contacts
+from clamber.recording.library import load_demo
+from clamber.run.folder import load_sequence, save_sequence
 
 HEIGHT = 0.6
 SUBJECT = {

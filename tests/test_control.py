@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber.control import INTEGRAL_LIMIT, JointLaw, driven_world
-from clamber.model import PHYSICS_STEP
+from clamber.execution.servo import INTEGRAL_LIMIT, JointLaw, driven_world
+from clamber.model.world import PHYSICS_STEP
 
 
 class PID:

@@ -9,15 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from clamber.contact import ContactInterval, ContactSequence
-from clamber.demo import (
-    CrossingOptions,
-    Demonstration,
-    load_demo,
-    synthesize_crossing,
-)
-from clamber.detect import detect_contacts
-from clamber.se3 import matrix_from_quat
+from clamber.contact.contact import ContactInterval, ContactSequence
+from clamber.model.se3 import matrix_from_quat
+from clamber.recording.crossing import CrossingOptions, synthesize_crossing
+from clamber.recording.demonstration import Demonstration
+from clamber.recording.detect import detect_contacts
+from clamber.recording.library import load_demo
 
 SEGMENTS = {
     "thigh": ("Hip", "Knee", 0.373),

@@ -16,7 +16,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from clamber.curves import (
+from clamber.study.climb import Outcome
+from clamber.study.curves import (
     BIN_RUNS,
     MAX_BINS,
     bins,
@@ -24,10 +25,9 @@ from clamber.curves import (
     save_curves,
     summarise,
 )
-from clamber.experiment import Run, Spec, load_spec, next_runs, strands
-from clamber.job import Outcome
-from clamber.success import wilson
-from clamber.sweep import CRASHED, Rows, cells, columns
+from clamber.study.spec import Run, Spec, load_spec, next_runs, strands
+from clamber.study.statistics import wilson
+from clamber.study.sweep import CRASHED, Rows, cells, columns
 from conftest import ROOT
 
 EXPERIMENTS = ROOT / "examples" / "experiments"

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 import yaml
 
-from clamber.demo import PARTS, ClimbOptions, Demonstration, load_demo, synthesize_climb
-from clamber.demo.boxes import read_obj_boxes
-from clamber.demo.demonstration import build_demonstration, runs
-from clamber.demo.marker_sets import recognise
+from clamber.contact.contact import PARTS
 from clamber.errors import InputError
-from clamber.scene import Scene
-from clamber.se3 import matrix_from_rpy
+from clamber.model.scene import Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.recording.boxes import read_obj_boxes
+from clamber.recording.demonstration import Demonstration, build_demonstration, runs
+from clamber.recording.library import load_demo
+from clamber.recording.marker_sets import recognise
+from clamber.recording.synthetic import ClimbOptions, synthesize_climb
 
 NAMES = [
     "Hips",

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import humanoids
-from clamber.description import compile_description, read_description
 from clamber.errors import InputError
+from clamber.model.description import compile_description, read_description
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.1
 

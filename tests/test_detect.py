@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 import yaml
 
-from clamber.contact import DIRECTIONS, ContactInterval, ContactSequence
-from clamber.demo import (
-    ClimbOptions,
-    Demonstration,
-    build_demonstration,
-    load_demo,
-    synthesize_climb,
-)
-from clamber.detect import (
+from clamber.contact.contact import DIRECTIONS, ContactInterval, ContactSequence
+from clamber.errors import InputError
+from clamber.model.scene import GROUND, Scene
+from clamber.model.se3 import matrix_from_quat
+from clamber.recording.demonstration import Demonstration, build_demonstration
+from clamber.recording.detect import (
     SEAT,
     DetectOptions,
     _fit_instant,
@@ -26,9 +23,8 @@ from clamber.detect import (
     _noise,
     detect_contacts,
 )
-from clamber.errors import InputError
-from clamber.scene import GROUND, Scene
-from clamber.se3 import matrix_from_quat
+from clamber.recording.library import load_demo
+from clamber.recording.synthetic import ClimbOptions, synthesize_climb
 
 ORDER = ("LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee")
 

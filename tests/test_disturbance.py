@@ -8,10 +8,10 @@ from dataclasses import FrozenInstanceError, fields
 import numpy as np
 import pytest
 
-from clamber.disturbance import LIMITS, Disturbance
 from clamber.errors import InputError
-from clamber.scene import Scene
-from clamber.truth import disturbed_scene, push_of
+from clamber.execution.disturbance import LIMITS, Disturbance
+from clamber.execution.perturbed import disturbed_scene, push_of
+from clamber.model.scene import Scene
 
 NAMES = tuple(f.name for f in fields(Disturbance))
 OF_THE_WORLD = {  # a value of each field that physics would notice

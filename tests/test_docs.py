@@ -129,7 +129,9 @@ def flags_of(command: str) -> frozenset[str]:
 
 
 COMMANDS = frozenset(
-    re.findall(r'subcommand\("(\w+)"\)', (ROOT / "src/clamber/cli.py").read_text())
+    re.findall(
+        r'subcommand\("(\w+)"\)', (ROOT / "src/clamber/cli/__init__.py").read_text()
+    )
 )
 
 
@@ -174,11 +176,11 @@ def _redirected(words: Sequence[str]) -> int:
 
 def read_yaml_block(block: Block, folder: Path) -> None:
     """Have a YAML block read by the reader that its fields belong to."""
-    from clamber.demo.recording import RecordingFile
-    from clamber.experiment import Spec, next_runs, strands
-    from clamber.io import _StateOnDisk
-    from clamber.model import RobotFile
-    from clamber.scene import SceneFile
+    from clamber.model.robot import RobotFile
+    from clamber.model.scene import SceneFile
+    from clamber.recording.recording import RecordingFile
+    from clamber.run.folder import _StateOnDisk
+    from clamber.study.spec import Spec, next_runs, strands
 
     fields = yaml.safe_load(block.text)
     assert isinstance(fields, dict), block.place

@@ -10,11 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber import execution, simulation
-from clamber.adaptation import FEELING_SPEED, REACH, Adapted
-from clamber.control import JointLaw
-from clamber.disturbance import Disturbance
-from clamber.execution import (
+from clamber.execution import executive as execution
+from clamber.execution import simulation
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.executive import (
     AHEAD,
     BLEND,
     DEVIATION,
@@ -36,10 +35,10 @@ from clamber.execution import (
     _ankles,
     _legs,
 )
-from clamber.leaning import Lean
-from clamber.model import PHYSICS_STEP, Kinematics
-from clamber.sensing import Measurement
-from clamber.simulation import (
+from clamber.execution.leaning import Lean
+from clamber.execution.sensors import Measurement
+from clamber.execution.servo import JointLaw
+from clamber.execution.simulation import (
     END_SPEED,
     FALLEN_HEIGHT,
     FALLEN_TILT,
@@ -47,7 +46,10 @@ from clamber.simulation import (
     judge,
     simulate,
 )
-from clamber.trajectory import HOLD_END, HOLD_START
+from clamber.model.kinematics import Kinematics
+from clamber.model.world import PHYSICS_STEP
+from clamber.planning.adaptation import FEELING_SPEED, REACH, Adapted
+from clamber.planning.trajectory import HOLD_END, HOLD_START
 
 EXACT = {"noise": 0.0, "delay": 0.0}
 TOP = 0.275  # [m] the box that was planned for

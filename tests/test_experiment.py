@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError
-from clamber.experiment import (
+from clamber.study.climb import Outcome
+from clamber.study.spec import (
     COARSE,
     LAG,
     MIN_ZONE,
@@ -22,7 +23,6 @@ from clamber.experiment import (
     strands,
     zone_of_change,
 )
-from clamber.job import Outcome
 from conftest import ROOT
 
 EXPERIMENTS = sorted((ROOT / "examples" / "experiments").glob("*.yaml"))

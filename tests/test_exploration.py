@@ -8,10 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clamber import exploration
-from clamber.contact import region_of
+from clamber.contact.contact import region_of
+from clamber.contact.policy import DemoPolicy
+from clamber.contact.scaling import retarget
+from clamber.contact.steps import split_moves
 from clamber.errors import InputError
-from clamber.exploration import (
+from clamber.model.scene import Scene
+from clamber.model.world import build_world
+from clamber.planning import free as exploration
+from clamber.planning.free import (
     Bounds,
     Reached,
     Stop,
@@ -19,15 +24,10 @@ from clamber.exploration import (
     explore,
     policy_counts,
 )
-from clamber.model import build_world
-from clamber.moves import split_moves
-from clamber.pipeline import PlanOptions
-from clamber.policy import DemoPolicy
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import contact_drift
-from clamber.scaling import retarget
-from clamber.scene import Scene
-from clamber.search import standing
+from clamber.planning.records import PlanOptions
+from clamber.step.change import standing
+from clamber.step.ik import IK
+from clamber.step.posture import contact_drift
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,13 @@ from mcap_ros2.decoder import DecoderFactory
 from scipy.interpolate import CubicHermiteSpline
 
 import clamber
-from clamber import cli, export, io
+from clamber import cli
 from clamber.errors import InputError, MissingDependency
-from clamber.model import Kinematics
-from clamber.pipeline import Plan
-from clamber.simulation import Rollout
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.planning.records import Plan
+from clamber.run import export
+from clamber.run import folder as io
 
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 

@@ -19,17 +19,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from clamber.demo import (
-    load_demo,
-    read_points,
-    synthesize_climb,
-    write_c3d,
-    write_trc,
-)
-from clamber.demo.boxes import read_obj_boxes
-from clamber.demo.demonstration import Demonstration
-from clamber.demo.synthetic import ClimbOptions
 from clamber.errors import InputError
+from clamber.recording.boxes import read_obj_boxes
+from clamber.recording.c3d import write_c3d
+from clamber.recording.demonstration import Demonstration
+from clamber.recording.library import load_demo
+from clamber.recording.recording import read_points
+from clamber.recording.synthetic import ClimbOptions, synthesize_climb
+from clamber.recording.trc import write_trc
 from test_demo import box_obj
 from test_recordings import MOTIVE as MOTIVE_NAMES
 from test_recordings import bvh_text, c3d_bytes, motive_csv, renamed, smpl_joints

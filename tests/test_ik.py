@@ -9,8 +9,17 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from clamber.errors import Status
-from clamber.model import Kinematics, World, build_world, load_robot
-from clamber.posture.ik import (
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import load_robot
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import (
+    frame_from_normal,
+    matrix_from_rpy,
+    quat_from_matrix,
+    rotation_vector,
+)
+from clamber.model.world import World, build_world
+from clamber.step.ik import (
     DAMPING,
     EDGE_INSET,
     EDGE_ROOM,
@@ -26,14 +35,7 @@ from clamber.posture.ik import (
     base_clearance,
     contact_clearance,
 )
-from clamber.scene import Box, Scene
-from clamber.se3 import (
-    frame_from_normal,
-    matrix_from_rpy,
-    quat_from_matrix,
-    rotation_vector,
-)
-from clamber.statics import support_ellipse, support_polygon
+from clamber.step.statics import support_ellipse, support_polygon
 
 UP = np.array([0.0, 0.0, 1.0])
 BALLS = ("LHand", "RElbow", "LKnee")

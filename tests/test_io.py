@@ -13,16 +13,18 @@ import numpy as np
 import pytest
 
 import clamber
-from clamber import io
-from clamber.contact import Contact, ContactInterval, ContactSequence, Stance
-from clamber.disturbance import Disturbance
+from clamber.contact.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.contact.steps import Skipped
 from clamber.errors import InputError, Status
-from clamber.model import ROBOTS, World
-from clamber.pipeline import Plan, Skipped
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy
-from clamber.simulation import Criterion, Rollout, Verdict
-from clamber.trajectory import Samples
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.simulation import Criterion, Rollout, Verdict
+from clamber.model.robot import ROBOTS
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.model.world import World
+from clamber.planning.records import Plan
+from clamber.planning.trajectory import Samples
+from clamber.run import folder as io
 
 HEIGHT = 0.25
 

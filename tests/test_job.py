@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from clamber import cli
-from clamber.disturbance import Disturbance
 from clamber.errors import InputError
-from clamber.job import FLAGS, Job, command_of, job_of, run_job
+from clamber.execution.disturbance import Disturbance
+from clamber.study.climb import FLAGS, Job, command_of, job_of, run_job
 
 
 def parsed(command: str) -> cli.ClimbCommand:

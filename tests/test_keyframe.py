@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clamber.contact import Contact
+from clamber.contact.contact import Contact
 from clamber.errors import Status
-from clamber.model import Kinematics, World, build_world, load_robot
-from clamber.posture import direct, gradient, lbfgs
-from clamber.posture.alternating import Alternation
-from clamber.posture.ik import EDGE_INSET, IK, ContactGoal
-from clamber.posture.keyframe import (
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import load_robot
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy, quat_from_matrix
+from clamber.model.world import World, build_world
+from clamber.step import direct, gradient, lbfgs
+from clamber.step.alternating import Alternation
+from clamber.step.ik import EDGE_INSET, IK, ContactGoal
+from clamber.step.posture import (
     Keyframe,
     KeyframeOptions,
     KeyframeTask,
@@ -30,9 +34,7 @@ from clamber.posture.keyframe import (
     stability_cost,
     torque_limits,
 )
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy, quat_from_matrix
-from clamber.statics import GRAVITY
+from clamber.step.statics import GRAVITY
 
 METHODS = {"direct": direct, "lbfgs": lbfgs, "gradient": gradient}
 OUTER = {"lbfgs": lbfgs, "gradient": gradient}

@@ -1,4 +1,4 @@
-"""The layers of the package, held by reading its source."""
+"""The rooms of the package, held by reading its source."""
 
 from __future__ import annotations
 
@@ -18,78 +18,32 @@ from conftest import ROOT
 
 SOURCE = ROOT / "src" / "clamber"
 
-# Each may import only from those before it.
-LAYERS = [
+# A tower: each room imports only from those before it.
+ROOMS = [
     "errors",
-    "se3",
-    "markup",
-    "mesh_files",
-    "description",
-    "boxes",
-    "scene",
-    "contact",
     "model",
-    "anatomy",
-    "proposal",
-    "disturbance",
-    "truth",
-    "sensing",
-    "leaning",
-    "statics",
-    "balance",
-    "demo",
-    "detect",
-    "scaling",
-    "policy",
-    "moves",
-    "posture",
-    "transition",
-    "path",
-    "search",
-    "retiming",
-    "trajectory",
-    "pipeline",
-    "exploration",
-    "checkup",
-    "route",
-    "stairs",
-    "build",
-    "traverse",
-    "control",
-    "terrain",
-    "adaptation",
+    "contact",
+    "recording",
+    "step",
+    "planning",
     "execution",
-    "simulation",
-    "alternatives",
-    "contraction",
-    "job",
-    "success",
-    "experiment",
-    "io",
-    "sweep",
-    "export",
-    "viz",
-    "curves",
-    "policy_plots",
-    "meshes",
-    "motion",
-    "report",
-    "view",
+    "run",
+    "show",
+    "study",
     "",  # the package itself: its public names
-    "terminal",
     "cli",
+    "__main__",
 ]
-
-FILES = sorted(SOURCE.rglob("*.py"))
 
 
 def module_of(file: Path) -> str:
-    """`posture.ik` of src/clamber/posture/ik.py, `` of the package's own."""
+    """`step.ik` of src/clamber/step/ik.py, `` of the package's own."""
     parts = file.relative_to(SOURCE).with_suffix("").parts
     return ".".join(p for p in parts if p != "__init__")
 
 
-MODULES = {module_of(f) for f in FILES}
+FILES = sorted(SOURCE.rglob("*.py"))
+TREES = {module_of(f): ast.parse(f.read_text()) for f in FILES}
 
 
 def imports_of(tree: ast.AST) -> set[str]:
@@ -100,96 +54,59 @@ def imports_of(tree: ast.AST) -> set[str]:
             found |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute"
-            found |= {
-                f"{node.module}.{a.name}"
-                if f"{node.module}.{a.name}".removeprefix("clamber.") in MODULES
-                else str(node.module)
-                for a in node.names
-            }
+            for a in node.names:
+                name = f"{node.module}.{a.name}"
+                is_module = name.removeprefix("clamber.") in TREES
+                found.add(name if is_module else str(node.module))
     own = {n for n in found if n.split(".")[0] == "clamber"}
     return {n.removeprefix("clamber").removeprefix(".") for n in own}
 
 
-TREES = {module_of(f): ast.parse(f.read_text()) for f in FILES}
-each_module = pytest.mark.parametrize("module", sorted(TREES))
+def upward(module: str, tree: ast.AST) -> list[str]:
+    """What a module may not import."""
+    rank = ROOMS.index(module.split(".")[0])
+    rooms = {used: used.split(".")[0] for used in imports_of(tree)}
+    return [u for u, room in rooms.items() if ROOMS.index(room) > rank]
 
 
-def layer(module: str) -> str:
-    return module.split(".")[0]
-
-
-@each_module
-def test_a_module_imports_only_from_the_layers_above_it(module: str):
-    assert layer(module) in LAYERS, f"{module} has no place in the list of layers"
-    rank = LAYERS.index(layer(module))
-    for used in imports_of(TREES[module]):
-        if layer(used) != layer(module):
-            assert layer(used) in LAYERS, f"{used} has no place in the list of layers"
-            assert LAYERS.index(layer(used)) < rank, f"{module} may not import {used}"
-
-
-def test_no_modules_import_each_other_in_a_circle():
+def test_rooms_import_from_those_below_them_and_never_in_a_circle():
+    assert not {m: up for m, t in TREES.items() if (up := upward(m, t))}
     graph = {m: imports_of(t) - {m} for m, t in TREES.items()}
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError with the circle
 
 
-def test_the_layer_test_sees_an_import_that_goes_up():
-    inside = ast.parse("def f():\n    from clamber.pipeline import plan\n")
-    assert imports_of(inside) == {"pipeline"}
-    assert LAYERS.index("pipeline") > LAYERS.index("errors")
-    assert imports_of(ast.parse("import clamber.se3\nimport numpy")) == {"se3"}
-    assert imports_of(ast.parse("from clamber import scene, plan")) == {"scene", ""}
+def test_an_import_that_goes_up_is_seen_wherever_it_is():
+    hidden = "def f():\n    from clamber.planning.planner import plan\n"
+    assert upward("step.path", ast.parse(hidden)) == ["planning.planner"]
+    assert upward("step.path", ast.parse("from clamber import plan")) == [""]
+    assert not upward("step.path", ast.parse("import clamber.model.se3\nimport numpy"))
+    assert imports_of(ast.parse("from clamber.model import se3")) == {"model.se3"}
 
 
-@each_module
-def test_no_import_is_hidden_from_the_running_program(module: str):
-    names = {n.id for n in ast.walk(TREES[module]) if isinstance(n, ast.Name)}
-    names |= {n.attr for n in ast.walk(TREES[module]) if isinstance(n, ast.Attribute)}
-    assert "TYPE_CHECKING" not in names
+def test_only_the_command_line_prints_and_no_import_is_hidden_from_the_program():
+    for module, tree in TREES.items():
+        for node in ast.walk(tree):
+            name = getattr(node, "id", getattr(node, "attr", ""))
+            assert name != "TYPE_CHECKING", module
+            if name == "print" and isinstance(node, ast.Name):
+                assert module.startswith("cli"), f"{module}, line {node.lineno}"
 
 
-@each_module
-def test_only_the_command_line_prints(module: str):
-    if module == "cli":
-        return
-    for node in ast.walk(TREES[module]):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            assert node.func.id != "print", f"{module}, line {node.lineno}"
+def test_no_module_is_shadowed_by_a_function_or_a_public_name():
+    for module, tree in TREES.items():
+        names = {
+            n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef)
+        }
+        assert not module or module.split(".")[-1] not in names, module
+        inside = {m.split(".")[-1] for m in TREES if m.rpartition(".")[0] == module}
+        assert not module or not inside & names, module
+    assert not set(clamber.__all__) & {m.split(".")[0] for m in TREES}
 
 
-@each_module
-def test_no_module_shares_its_name_with_a_function_it_exports(module: str):
-    body = TREES[module].body
-    defined = {
-        n.name for n in body if isinstance(n, ast.FunctionDef | ast.ClassDef)
-    } | {
-        a.asname or a.name
-        for n in body
-        if isinstance(n, ast.ImportFrom)
-        for a in n.names
-    }
-    assert module.split(".")[-1] not in defined or module == ""
-    children = {m.split(".")[-1] for m in MODULES if m.rpartition(".")[0] == module}
-    functions = {n.name for n in body if isinstance(n, ast.FunctionDef)}
-    assert not children & functions, "a module is shadowed by a function of its package"
-
-
-def test_no_public_name_is_that_of_a_module():
-    assert not set(clamber.__all__) & {m.split(".")[0] for m in MODULES}
-
-
-def test_every_public_name_is_found_where_the_package_says():
+def test_every_public_name_is_found_where_the_package_and_its_stub_say():
     for name, home in clamber._HOME.items():
         value = getattr(clamber, name)
         assert value is getattr(importlib.import_module(f"clamber.{home}"), name)
-
-
-def test_a_name_that_is_not_public_is_named_in_the_error():
-    with pytest.raises(AttributeError, match="no attribute 'climb_everest'"):
-        _ = clamber.climb_everest
-
-
-def test_type_checkers_are_told_the_same_names():
     stub = ast.parse((SOURCE / "__init__.pyi").read_text())
     homes = {
         alias.asname: str(node.module).removeprefix("clamber.")
@@ -198,6 +115,11 @@ def test_type_checkers_are_told_the_same_names():
         for alias in node.names
     }
     assert homes == clamber._HOME
+
+
+def test_a_name_that_is_not_public_is_named_in_the_error():
+    with pytest.raises(AttributeError, match="no attribute 'climb_everest'"):
+        _ = clamber.climb_everest
 
 
 def test_importing_the_package_loads_no_library():

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from clamber.disturbance import Disturbance
-from clamber.leaning import (
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.leaning import (
     AWAY,
     MISSING,
     SEARCHED,
@@ -17,8 +17,8 @@ from clamber.leaning import (
     strikes,
     striking_part,
 )
-from clamber.model import Kinematics
-from clamber.simulation import judge, simulate
+from clamber.execution.simulation import judge, simulate
+from clamber.model.kinematics import Kinematics
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 import humanoids
-from clamber.description import compile_description, read_description
 from clamber.errors import InputError
-from clamber.mesh_files import read_mesh
-from clamber.proposal import propose_robot
+from clamber.model.description import compile_description, read_description
+from clamber.model.mesh_files import read_mesh
+from clamber.model.propose import propose_robot
 from test_description import CUBE, stl
 
 QUADS = [
@@ -282,7 +282,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("clamber.markup.MAX_BYTES", len(GOOD) - 1)
+    monkeypatch.setattr("clamber.model.markup.MAX_BYTES", len(GOOD) - 1)
     with pytest.raises(InputError, match="at most"):
         read(tmp_path, GOOD)
 

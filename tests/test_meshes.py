@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import clamber
-from clamber.meshes import (
+from clamber.show.meshes import (
     MAX_TRIANGLES,
     body_meshes,
     geom_colour,

@@ -8,17 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clamber.errors import InputError
-from clamber.model import (
-    ROBOTS,
-    Balls,
-    Kinematics,
-    World,
-    build_world,
-    limb_lengths,
-    load_robot,
-)
-from clamber.scene import GROUND, Box, Scene
-from clamber.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from clamber.model.kinematics import Balls, Kinematics, limb_lengths
+from clamber.model.robot import ROBOTS, load_robot
+from clamber.model.scene import GROUND, Box, Scene
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from clamber.model.world import World, build_world
 
 UP = np.array([0.0, 0.0, 1.0])
 SEEDS = range(10)

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from clamber.contact import Contact, ContactSequence, Stance
-from clamber.model import World, build_world, load_robot
-from clamber.moves import SAME_PLACE, Move, split_moves
-from clamber.scene import GROUND, Scene
+from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.contact.steps import SAME_PLACE, Move, split_moves
+from clamber.model.robot import load_robot
+from clamber.model.scene import GROUND, Scene
+from clamber.model.world import World, build_world
 
 FEET = ("LFoot", "RFoot")
 

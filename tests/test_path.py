@@ -9,9 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber import path as path_module
 from clamber.errors import Status
-from clamber.path import (
+from clamber.model.scene import Scene
+from clamber.planning.planner import plan
+from clamber.step import path as path_module
+from clamber.step.ik import IK
+from clamber.step.path import (
     SAFE_HEIGHT,
     TOP_RISE,
     arc,
@@ -20,11 +23,8 @@ from clamber.path import (
     overlap,
     plan_path,
 )
-from clamber.pipeline import plan
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import CLEARANCE, bearing_frames, contact_drift
-from clamber.scene import Scene
-from clamber.statics import com_margin, support_polygon
+from clamber.step.posture import CLEARANCE, bearing_frames, contact_drift
+from clamber.step.statics import com_margin, support_polygon
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,13 @@ import pytest
 import yaml
 
 from clamber.errors import InputError, Status
-from clamber.io import save_plan, save_rollout
-from clamber.model import ROBOTS, load_robot
-from clamber.pipeline import VARIATIONS, PlanOptions, plan
-from clamber.posture.keyframe import KeyframeOptions, equilibrium_at
-from clamber.scene import Box, Scene
-from clamber.simulation import judge, simulate
+from clamber.execution.simulation import judge, simulate
+from clamber.model.robot import ROBOTS, load_robot
+from clamber.model.scene import Box, Scene
+from clamber.planning.planner import VARIATIONS, plan
+from clamber.planning.records import PlanOptions
+from clamber.run.folder import save_plan, save_rollout
+from clamber.step.posture import KeyframeOptions, equilibrium_at
 
 ROOT = Path(__file__).parents[1]
 
@@ -250,8 +251,8 @@ def test_as_slowly_as_in_the_experiments(demo_sequence, coman, tmp_path, ask_jud
 
 @pytest.mark.slow
 def test_a_real_recording_is_climbed(coman, shared, tmp_path, ask_judge):
-    from clamber.demo import load_demo
-    from clamber.detect import detect_contacts
+    from clamber.recording.detect import detect_contacts
+    from clamber.recording.library import load_demo
 
     if not (shared / "demos" / "climb-0" / "joints.npy").is_file():
         pytest.skip("no recording climb-0 beside the repository")
@@ -269,8 +270,8 @@ def test_the_robot_stands_up_as_the_person_does(
     coman, shared, tmp_path, ask_judge, name, height
 ):
     """On hands and knees, then on its feet; climb-1 at its own ratio is 0.42 m."""
-    from clamber.demo import load_demo
-    from clamber.detect import detect_contacts
+    from clamber.recording.detect import detect_contacts
+    from clamber.recording.library import load_demo
 
     if not (shared / "demos" / name / "joints.npy").is_file():
         pytest.skip(f"no recording {name} beside the repository")
@@ -388,7 +389,7 @@ def test_where_a_step_is_missed_other_weights_are_tried(
 ):
     scene = at_distance(0.19, 0.42)
     varied = plan(demo_sequence, coman, scene)
-    monkeypatch.setattr("clamber.pipeline.VARIATIONS", ({},))
+    monkeypatch.setattr("clamber.planning.planner.VARIATIONS", ({},))
     once = plan(demo_sequence, coman, scene)
     assert varied.complete
     assert not once.complete

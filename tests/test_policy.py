@@ -9,10 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber.contact import Contact, Stance
-from clamber.errors import InputError
-from clamber.io import load_policy, policy_summary, save_policy
-from clamber.policy import (
+from clamber.contact.contact import Contact, Stance
+from clamber.contact.policy import (
     IMPOSED,
     DemoPolicy,
     Edge,
@@ -25,8 +23,10 @@ from clamber.policy import (
     pelvis_rotation,
     wrap,
 )
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy
+from clamber.errors import InputError
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.run.folder import load_policy, policy_summary, save_policy
 
 
 def table(yaw: float = 0.0, centre=(1.0, 0.0)) -> Box:

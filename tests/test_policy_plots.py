@@ -9,10 +9,10 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from clamber import policy_plots
-from clamber.contraction import learn_policy
-from clamber.policy import GeneralPolicy
-from clamber.policy_plots import pelvis_plot, policy_plot, save_pictures
+from clamber.contact.learn import learn_policy
+from clamber.contact.policy import GeneralPolicy
+from clamber.show import policy_plots
+from clamber.show.policy_plots import pelvis_plot, policy_plot, save_pictures
 from test_contraction import crossing, posed
 
 

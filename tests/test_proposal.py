@@ -12,13 +12,15 @@ import pytest
 import yaml
 
 import humanoids
-from clamber.anatomy import find_limbs, geom_points, geom_volume, joint_range
-from clamber.checkup import check_robot
 from clamber.errors import InputError
-from clamber.io import save_proposal
-from clamber.model import Kinematics, build_world, load_robot
-from clamber.proposal import FOREARM, UPPER_ARM, effort_of, propose_robot
-from clamber.scene import Scene
+from clamber.model.kinematics import Kinematics
+from clamber.model.limbs import find_limbs, geom_points, geom_volume, joint_range
+from clamber.model.propose import FOREARM, UPPER_ARM, effort_of, propose_robot
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene
+from clamber.model.world import build_world
+from clamber.planning.diagnose import check_robot
+from clamber.run.folder import save_proposal
 
 TEXTS = {"mjcf": humanoids.mjcf, "urdf": humanoids.urdf}
 SUFFIX = {"mjcf": "small.xml", "urdf": "small.urdf"}
@@ -543,8 +545,8 @@ def test_a_thumb_of_more_joints_than_a_finger_is_no_part_of_the_arm(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 1.0])
 def test_a_new_robot_climbs_its_own_knee_height(proposed, demo_sequence, share):
-    from clamber.pipeline import plan
-    from clamber.simulation import judge, simulate
+    from clamber.execution.simulation import judge, simulate
+    from clamber.planning.planner import plan
 
     _, robot, _ = proposed
     height = round(share * check_robot(robot).knee_height, 3)

@@ -13,26 +13,21 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import clamber
-from clamber.boxes import AXES, to_z_up
-from clamber.contact import ContactInterval
-from clamber.demo import (
-    ClimbOptions,
-    Demonstration,
-    find_levels,
-    fit_levels,
-    load_demo,
-    read_points,
-    synthesize_climb,
-    write_c3d,
-    write_trc,
-)
-from clamber.demo.bvh import read_bvh
-from clamber.demo.demonstration import estimate_offsets
-from clamber.demo.marker_sets import recognise
-from clamber.demo.points import unique_names
-from clamber.detect import detect_contacts
+from clamber.contact.contact import ContactInterval
 from clamber.errors import InputError
-from clamber.scene import Scene
+from clamber.model.scene import Scene
+from clamber.model.terrain import AXES, to_z_up
+from clamber.recording.bvh import read_bvh
+from clamber.recording.c3d import write_c3d
+from clamber.recording.demonstration import Demonstration, estimate_offsets
+from clamber.recording.detect import detect_contacts
+from clamber.recording.levels import find_levels, fit_levels
+from clamber.recording.library import load_demo
+from clamber.recording.marker_sets import recognise
+from clamber.recording.points import unique_names
+from clamber.recording.recording import read_points
+from clamber.recording.synthetic import ClimbOptions, synthesize_climb
+from clamber.recording.trc import write_trc
 from conftest import ROOT
 
 DATA = ROOT / "tests" / "data"
@@ -363,7 +358,7 @@ def test_markers_on_both_sides_of_a_joint_are_averaged():
             "{s}SHO", "{s}ELB", "{s}WRA", "{s}WRB", "{s}FIN",
         )
     ]  # fmt: skip
-    from clamber.demo.marker_sets import solve_centres
+    from clamber.recording.marker_sets import solve_centres
 
     found = recognise(names)
     assert found.on_skin
@@ -379,7 +374,7 @@ def test_parts_go_before_the_joints_of_a_marker_set():
     found = recognise(GAIT, parts={"LKnee": "LTIB", "RHand": ["RFIN", "RWRA"]})
     assert found.on_skin
     assert "`parts`" in found.name
-    from clamber.demo.marker_sets import solve_centres
+    from clamber.recording.marker_sets import solve_centres
 
     track = {i: np.full((2, 3), float(i)) + np.eye(3)[:2] * i for i in found.used()}
     points = solve_centres(found, track)
@@ -390,7 +385,7 @@ def test_parts_go_before_the_joints_of_a_marker_set():
 
 def test_a_thin_box_is_never_turned_inside_out():
     demo, _ = climb()
-    from clamber.demo.levels import _raised
+    from clamber.recording.levels import _raised
 
     box = replace(demo.scene.boxes[0], size=np.array([1.0, 1.0, 0.02]))
     assert _raised(box, -0.05).size[2] == pytest.approx(1e-3)
@@ -398,7 +393,7 @@ def test_a_thin_box_is_never_turned_inside_out():
 
 def test_hips_are_where_the_regression_puts_them():
     """Harrington's numbers, for a pelvis 250 mm wide and 150 mm deep at the origin."""
-    from clamber.demo.marker_sets import _hips
+    from clamber.recording.marker_sets import _hips
 
     place = {
         "LAsis": [0, 0.125, 0], "RAsis": [0, -0.125, 0], "LPsis": [-0.15, 0.04, 0],

@@ -16,11 +16,15 @@ import pytest
 from PIL import Image
 
 import clamber
-from clamber import cli, io, motion, report, viz
+from clamber import cli
 from clamber.errors import InputError
-from clamber.model import PHYSICS_STEP, Kinematics
-from clamber.pipeline import Plan
-from clamber.simulation import STRIDE, Rollout
+from clamber.execution.simulation import STRIDE, Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.world import PHYSICS_STEP
+from clamber.planning.records import Plan
+from clamber.run import folder as io
+from clamber.show import report, viz
+from clamber.show import sample as motion
 
 NASTY = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>"
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from clamber.posture.keyframe import bearing_frames
-from clamber.retiming import (
+from clamber.planning.timing import (
     SMOOTHING,
     TOUCH_SPEED,
     bearable,
@@ -20,14 +19,15 @@ from clamber.retiming import (
     least_torques,
     sample_law,
 )
-from clamber.statics import cone_generators
-from clamber.trajectory import (
+from clamber.planning.trajectory import (
     HOLD_END,
     HOLD_START,
     RATE,
     build_trajectory,
     holding_torque,
 )
+from clamber.step.posture import bearing_frames
+from clamber.step.statics import cone_generators
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_a_joint_keeps_a_speed_limit_of_its_own(demo_plan, knee_phases, fast):
 def test_a_run_folder_keeps_the_word_max_and_numbers():
     from pydantic import TypeAdapter
 
-    from clamber.pipeline import PlanOptions
+    from clamber.planning.records import PlanOptions
 
     adapter = TypeAdapter(PlanOptions)
     for speed in ("max", 0.3):

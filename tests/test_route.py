@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError
-from clamber.route import (
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.planning.route import (
     BESIDE,
     BORDER,
     GAP,
@@ -15,8 +17,6 @@ from clamber.route import (
     goal_of,
     room_on,
 )
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy
 
 
 def box(name: str, x: float, size=(0.6, 0.8, 0.25), y=0.0, yaw=0.0, below=0.0) -> Box:

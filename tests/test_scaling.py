@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber.contact import Contact, ContactSequence, Stance
+from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.contact.scaling import limb_scales, near_edge, retarget
 from clamber.errors import InputError
-from clamber.model import Kinematics, World, build_world, limb_lengths, load_robot
-from clamber.scaling import limb_scales, near_edge, retarget
-from clamber.scene import GROUND, Box, Scene
-from clamber.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from clamber.model.kinematics import Kinematics, limb_lengths
+from clamber.model.robot import load_robot
+from clamber.model.scene import GROUND, Box, Scene
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
+from clamber.model.world import World, build_world
 
 UP = np.array([0.0, 0.0, 1.0])
 PERSON = {"upper_arm": 0.30, "forearm": 0.26, "thigh": 0.42, "shank": 0.40}

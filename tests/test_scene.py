@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from clamber.errors import InputError
-from clamber.io import scene_fields
-from clamber.scene import GROUND, Box, Scene, Support, load_scene
-from clamber.se3 import matrix_from_rpy
+from clamber.model.scene import GROUND, Box, Scene, Support, load_scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.run.folder import scene_fields
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clamber.se3 import (
+from clamber.model.se3 import (
     frame_from_normal,
     matrix_from_quat,
     matrix_from_rpy,

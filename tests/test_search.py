@@ -8,19 +8,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clamber import search
-from clamber.contact import Contact, Stance
+from clamber.contact.contact import Contact, Stance
+from clamber.contact.scaling import retarget
+from clamber.contact.steps import Guide, Move, Step, split_moves
 from clamber.errors import Status
-from clamber.model import build_world
-from clamber.moves import Guide, Move, Step, split_moves
-from clamber.pipeline import plan
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import KeyframeOptions
-from clamber.scaling import retarget
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy
-from clamber.search import plan_step, plan_steps, repairs, standing
-from clamber.transition import MARGINS, MOVED
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.model.world import build_world
+from clamber.planning import search
+from clamber.planning.planner import plan
+from clamber.planning.search import plan_steps, repairs
+from clamber.step.change import plan_step, standing
+from clamber.step.ik import IK
+from clamber.step.posture import KeyframeOptions
+from clamber.step.transition import MARGINS, MOVED
 
 OPTIONS = KeyframeOptions()
 HEIGHT = 0.275

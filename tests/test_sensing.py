@@ -6,9 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber.model import World, build_world
-from clamber.scene import Scene
-from clamber.sensing import (
+from clamber.execution.sensors import (
     ANGLE_NOISE,
     BLOCK,
     FORCE_NOISE,
@@ -19,6 +17,8 @@ from clamber.sensing import (
     Sensors,
     surface_forces,
 )
+from clamber.model.scene import Scene
+from clamber.model.world import World, build_world
 
 N = 4 * BLOCK
 

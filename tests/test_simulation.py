@@ -8,10 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber.disturbance import Disturbance
-from clamber.model import PHYSICS_STEP, build_world
-from clamber.scene import Scene
-from clamber.simulation import (
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.simulation import (
     END_SPEED,
     GOAL_TOL,
     HEIGHT_TOL,
@@ -24,6 +22,8 @@ from clamber.simulation import (
     judge,
     simulate,
 )
+from clamber.model.scene import Scene
+from clamber.model.world import PHYSICS_STEP, build_world
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber import traverse
-from clamber.contact import Contact
-from clamber.model import build_world, load_robot
-from clamber.path import interpolate, overlap, watched_pairs
-from clamber.pipeline import PlanOptions
-from clamber.posture.ik import IK
-from clamber.route import BORDER, Place, find_platforms
-from clamber.scene import GROUND, Scene
-from clamber.se3 import matrix_from_rpy
-from clamber.search import standing
-from clamber.stairs import CLEAR, WORTH, Gait, is_flight, next_contacts
+from clamber.contact.contact import Contact
+from clamber.model.robot import load_robot
+from clamber.model.scene import GROUND, Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.model.world import build_world
+from clamber.planning import gait as traverse
+from clamber.planning.records import PlanOptions
+from clamber.planning.route import BORDER, Place, find_platforms
+from clamber.planning.stairs import CLEAR, WORTH, Gait, is_flight, next_contacts
+from clamber.step.change import standing
+from clamber.step.ik import IK
+from clamber.step.path import interpolate, overlap, watched_pairs
 from conftest import stairs
 from test_traverse import POLICY
 

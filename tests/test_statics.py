@@ -12,8 +12,8 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
-from clamber.se3 import matrix_from_rpy
-from clamber.statics import (
+from clamber.model.se3 import matrix_from_rpy
+from clamber.step.statics import (
     BALANCE_TOL,
     GRAVITY,
     TorqueLimits,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 
-from clamber.success import CHI2, SLOPES, Z, fit_break, wilson
+from clamber.study.statistics import CHI2, SLOPES, Z, fit_break, wilson
 
 
 @pytest.mark.parametrize(("k", "n"), [(1, 7), (15, 30), (29, 30), (298, 300)])

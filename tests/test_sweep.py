@@ -20,9 +20,9 @@ import pytest
 
 import sweep_jobs
 from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.experiment import Spec, load_spec
-from clamber.job import Outcome
-from clamber.sweep import CRASHED, load_sweep, read_outcomes, run_sweep
+from clamber.study.climb import Outcome
+from clamber.study.spec import Spec, load_spec
+from clamber.study.sweep import CRASHED, load_sweep, read_outcomes, run_sweep
 
 SEARCH = """
 base: {height: 0.275}
@@ -394,7 +394,7 @@ def test_a_scheduler_that_does_not_answer_is_named(
     spec: Spec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("clamber.sweep.CONNECT", 0.5)
+    monkeypatch.setattr("clamber.study.sweep.CONNECT", 0.5)
     with pytest.raises(InputError, match=r"--scheduler is 'tcp://127\.0\.0\.1:1'"):
         run_sweep(spec, tmp_path / "out", scheduler="tcp://127.0.0.1:1")
 

@@ -16,7 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from clamber import cli, io, terminal
+from clamber import cli
+from clamber.cli import output as terminal
+from clamber.run import folder as io
 from conftest import ROOT
 
 COLUMNS = 80
@@ -29,7 +31,7 @@ def folder(
     one_hand_plan, one_hand_rollout, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A run folder `run` of the shortest motion, a scene, a spec and a policy."""
-    from clamber.simulation import judge
+    from clamber.execution.simulation import judge
 
     folder = tmp_path_factory.mktemp("terminal")
     run = folder / "run"

@@ -9,9 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy
-from clamber.terrain import (
+from clamber.execution.terrain import (
     CAUTION,
     FELT_SIGMA,
     HEIGHT_SIGMA,
@@ -20,6 +18,8 @@ from clamber.terrain import (
     believed_scene,
     fitted_box,
 )
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy
 
 PRIOR = np.array([HEIGHT_SIGMA, SLOPE_SIGMA, SLOPE_SIGMA])
 RPYS = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.7), (0.1, -0.15, -2.0), (np.pi / 2, 0.0, 0.3)]

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from clamber.posture.keyframe import bearing_frames
-from clamber.statics import com_margin, cone_generators, contact_forces, support_polygon
-from clamber.trajectory import (
+from clamber.planning.trajectory import (
     BASE_LENGTH,
     GRAVITY,
     HOLD_END,
@@ -25,6 +23,13 @@ from clamber.trajectory import (
     phase_torques,
     point_prices,
     zero_moment_point,
+)
+from clamber.step.posture import bearing_frames
+from clamber.step.statics import (
+    com_margin,
+    cone_generators,
+    contact_forces,
+    support_polygon,
 )
 
 
@@ -434,7 +439,7 @@ def test_a_fast_motion_is_slowed_down_until_inertia_leaves_it_balanced(
     world = demo_plan.world
     margin = lowest_dynamic_margin(demo_kinematics, world, first, 2.0)
     assert margin > 0.0
-    unlimited = "clamber.trajectory._balanced_cruise"
+    unlimited = "clamber.planning.trajectory._balanced_cruise"
     monkeypatch.setattr(unlimited, lambda kin, phase, curve, length, cruise: cruise)
     assert lowest_dynamic_margin(demo_kinematics, world, first, 2.0) < -0.01 < margin
 

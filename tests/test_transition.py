@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber.contact import Contact
+from clamber.contact.contact import Contact
 from clamber.errors import Status
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import bearing_frames, contact_drift, equilibrium_at
-from clamber.se3 import matrix_from_rpy
-from clamber.statics import com_margin, support_ellipse, support_polygon
-from clamber.transition import (
+from clamber.model.se3 import matrix_from_rpy
+from clamber.step.ik import IK
+from clamber.step.posture import bearing_frames, contact_drift, equilibrium_at
+from clamber.step.statics import com_margin, support_ellipse, support_polygon
+from clamber.step.transition import (
     MARGINS,
     REACH_ANGLE,
     approach_contact,

@@ -9,20 +9,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clamber import traverse as module
-from clamber.build import build_of
-from clamber.contact import Contact
+from clamber.contact.contact import Contact
+from clamber.contact.policy import GeneralPolicy, Option, PelvisDistribution
 from clamber.errors import InputError
-from clamber.io import load_plan, save_plan
-from clamber.model import Kinematics, build_world, load_robot
-from clamber.pipeline import Plan, PlanOptions
-from clamber.policy import GeneralPolicy, Option, PelvisDistribution
-from clamber.posture import direct
-from clamber.posture.ik import IK
-from clamber.posture.keyframe import KeyframeTask, contact_drift
-from clamber.scene import GROUND, Box, Scene
-from clamber.search import standing
-from clamber.traverse import cost_to_go, follow_policy, plan_traverse
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import load_robot
+from clamber.model.scene import GROUND, Box, Scene
+from clamber.model.world import build_world
+from clamber.planning import gait as module
+from clamber.planning.gait import cost_to_go, follow_policy, plan_traverse
+from clamber.planning.proportions import build_of
+from clamber.planning.records import Plan, PlanOptions
+from clamber.run.folder import load_plan, save_plan
+from clamber.step import direct
+from clamber.step.change import standing
+from clamber.step.ik import IK
+from clamber.step.posture import KeyframeTask, contact_drift
 from conftest import stairs
 
 

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clamber.disturbance import Disturbance
 from clamber.errors import InputError
-from clamber.model import PHYSICS_STEP, World, build_world
-from clamber.scene import Box, Scene
-from clamber.se3 import matrix_from_rpy
-from clamber.simulation import simulate
-from clamber.truth import (
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.perturbed import (
     PUSH_MARGIN,
     PUSH_TIME,
     TILE,
@@ -23,6 +19,10 @@ from clamber.truth import (
     disturbed_world,
     push_of,
 )
+from clamber.execution.simulation import simulate
+from clamber.model.scene import Box, Scene
+from clamber.model.se3 import matrix_from_rpy
+from clamber.model.world import PHYSICS_STEP, World, build_world
 
 YAW = 0.4
 EXACT = {"noise": 0.0, "delay": 0.0}

@@ -18,12 +18,12 @@ import pytest
 import clamber
 from clamber import cli
 from clamber.errors import MissingDependency
-from clamber.model import Kinematics
-from clamber.pipeline import Plan
-from clamber.scene import Scene
-from clamber.view import charts, edits, open_view
-from clamber.view.person import beside, figure_at, show_person
-from clamber.view.shown import (
+from clamber.model.kinematics import Kinematics
+from clamber.model.scene import Scene
+from clamber.planning.records import Plan
+from clamber.show.view import charts, edits, open_view
+from clamber.show.view.person import beside, figure_at, show_person
+from clamber.show.view.shown import (
     Shown,
     force_arrow,
     frame_at,
@@ -354,7 +354,7 @@ def test_the_command_says_how_to_get_to_the_page(
         host=host, port=port, wanted=8080, missing=[], url=f"http://{host}:{port}"
     )
     page.close = lambda: None
-    monkeypatch.setattr("clamber.view.open_view", lambda *_, **__: page)
+    monkeypatch.setattr("clamber.show.view.open_view", lambda *_, **__: page)
 
     def interrupted(_: float) -> None:
         raise KeyboardInterrupt

@@ -19,13 +19,13 @@ import pytest
 from PIL import Image, ImageChops
 
 import clamber
-from clamber import io
-from clamber.contact import ContactSequence, Stance
-from clamber.model import Kinematics
-from clamber.pipeline import PlanOptions
-from clamber.view import open_view
-from clamber.view.shown import frame_at, show_run
-from clamber.view.stage import LAYERS, RECORDING
+from clamber.contact.contact import ContactSequence, Stance
+from clamber.model.kinematics import Kinematics
+from clamber.planning.records import PlanOptions
+from clamber.run import folder as io
+from clamber.show.view import open_view
+from clamber.show.view.shown import frame_at, show_run
+from clamber.show.view.stage import LAYERS, RECORDING
 
 pytest.importorskip("viser")
 BROWSER_FLAGS: list[str] = []  # as Chromium draws by itself where there is no card

@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 import clamber
-from clamber.contact import ContactSequence
-from clamber.model import Kinematics
-from clamber.motion import stance_rows
-from clamber.pipeline import Plan
-from clamber.view import charts
-from clamber.view.charts import Line
-from clamber.view.person import Person, show_person
-from clamber.view.shown import Shown, frame_at, show_run
-from clamber.viz import PHASE_COLOURS, frame_view
+from clamber.contact.contact import ContactSequence
+from clamber.model.kinematics import Kinematics
+from clamber.planning.records import Plan
+from clamber.show.sample import stance_rows
+from clamber.show.view import charts
+from clamber.show.view.charts import Line
+from clamber.show.view.person import Person, show_person
+from clamber.show.view.shown import Shown, frame_at, show_run
+from clamber.show.viz import PHASE_COLOURS, frame_view
 
 TIME = np.linspace(0.0, 8.0, 801)
 
@@ -317,7 +317,7 @@ def told() -> list[float]:
 @pytest.fixture
 def clock(told: list[float]) -> Any:
     pytest.importorskip("viser")
-    from clamber.view.page import Clock
+    from clamber.show.view.page import Clock
 
     clock = Clock(told.append)
     clock.span(1.0, 5.0, [4.0, 1.0, 2.0, 5.0])
@@ -373,7 +373,7 @@ def test_a_run_of_one_instant_does_not_play(clock: Any):
 
 def test_the_scene_is_told_of_each_frame_and_the_panel_of_some():
     pytest.importorskip("viser")
-    from clamber.view.page import PANEL_SECONDS, Page
+    from clamber.show.view.page import PANEL_SECONDS, Page
 
     page = Page("127.0.0.1", 18110, "test")
     try:
@@ -408,7 +408,7 @@ def test_the_scene_is_told_of_each_frame_and_the_panel_of_some():
 )
 def test_the_address_is_one_that_a_browser_takes(host: str, url: str):
     pytest.importorskip("viser")
-    from clamber.view.page import Page
+    from clamber.show.view.page import Page
 
     address: Any = Page.url
     assert address.fget(SimpleNamespace(host=host, port=7)) == url
@@ -416,7 +416,7 @@ def test_the_address_is_one_that_a_browser_takes(host: str, url: str):
 
 def test_lines_on_the_ground_make_squares_of_one_size():
     pytest.importorskip("viser")
-    from clamber.view import page
+    from clamber.show.view import page
 
     vertices, faces = page._ground_lines()
     strips = vertices.reshape(-1, 4, 3)
@@ -435,7 +435,7 @@ def test_lines_on_the_ground_make_squares_of_one_size():
 @pytest.mark.parametrize("camera", ["corner", "side", "front", "behind", "top"])
 def test_a_camera_has_all_points_in_its_picture(camera: Any, rng: np.random.Generator):
     pytest.importorskip("viser")
-    from clamber.view.page import ASPECT, eye_of
+    from clamber.show.view.page import ASPECT, eye_of
 
     points = rng.normal(size=(40, 3)) * [0.6, 0.3, 0.4] + [0.5, 0.0, 0.5]
     view = frame_view(points, ASPECT, yaw=0.7, fovy=45.0, camera=camera)

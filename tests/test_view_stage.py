@@ -15,15 +15,14 @@ import pytest
 from scipy.spatial import ConvexHull
 
 import clamber
-from clamber.contact import ContactSequence
-from clamber.model import Kinematics
-from clamber.pipeline import Plan
-from clamber.scene import Scene
-from clamber.simulation import Rollout
-from clamber.statics import support_ellipse
-from clamber.view import edits
-from clamber.view.person import beside, change_times, figure_at, show_person
-from clamber.view.shown import (
+from clamber.contact.contact import ContactSequence
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.scene import Scene
+from clamber.planning.records import Plan
+from clamber.show.view import edits
+from clamber.show.view.person import beside, change_times, figure_at, show_person
+from clamber.show.view.shown import (
     ALIKE,
     ALIKE_TURNED,
     ARROW,
@@ -40,7 +39,8 @@ from clamber.view.shown import (
     way_at,
     weight_of,
 )
-from clamber.viz import PHASE_COLOURS, bearing_of
+from clamber.show.viz import PHASE_COLOURS, bearing_of
+from clamber.step.statics import support_ellipse
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -299,7 +299,7 @@ def kept() -> Any:
 
 
 def test_links_that_hang_in_one_another_are_where_the_bodies_are(kept: Any, ran: Shown):
-    from clamber.view.stage import Links
+    from clamber.show.view.stage import Links
 
     links = Links(kept, "/robot", ran.world, ran.meshes)
     kin = Kinematics(ran.world)
@@ -325,7 +325,7 @@ def test_links_that_hang_in_one_another_are_where_the_bodies_are(kept: Any, ran:
 
 
 def test_a_link_that_has_not_moved_is_not_sent(kept: Any, ran: Shown):
-    from clamber.view.stage import Links
+    from clamber.show.view.stage import Links
 
     links = Links(kept, "/robot", ran.world, ran.meshes)
     poses = frame_at(ran, Kinematics(ran.world), ran.duration).poses.copy()
@@ -341,7 +341,7 @@ def test_a_link_that_has_not_moved_is_not_sent(kept: Any, ran: Shown):
 
 
 def test_a_ghost_is_sent_where_it_is_seen_and_what_that_hangs_in(kept: Any, ran: Shown):
-    from clamber.view.stage import Links
+    from clamber.show.view.stage import Links
 
     links = Links(kept, "/ghost", ran.world, ran.meshes, ghost=True)
     frame = frame_at(ran, Kinematics(ran.world), ran.duration / 2)
@@ -364,7 +364,7 @@ def test_a_ghost_is_sent_where_it_is_seen_and_what_that_hangs_in(kept: Any, ran:
 
 
 def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
-    from clamber.view.stage import CONE_HEIGHT, cones, discs, linear
+    from clamber.show.view.stage import CONE_HEIGHT, cones, discs, linear
 
     tilted = np.array([0.0, math.sin(0.3), math.cos(0.3)])
     touches = [
@@ -404,7 +404,7 @@ def test_a_cone_opens_by_the_angle_of_friction(kept: Any):
 
 
 def test_without_polygon_there_is_none_to_draw(kept: Any, ran: Shown):
-    from clamber.view.stage import Balance
+    from clamber.show.view.stage import Balance
 
     balance = Balance(kept, "/balance")
     nodes = kept.scene.nodes
@@ -431,7 +431,7 @@ def test_without_polygon_there_is_none_to_draw(kept: Any, ran: Shown):
 
 
 def test_limbs_let_see_the_forces_in_them_and_no_others(kept: Any, ran: Shown):
-    from clamber.view.stage import Stage
+    from clamber.show.view.stage import Stage
 
     kept.scene.nodes = {}
     stage = Stage(kept, ran, "/run")

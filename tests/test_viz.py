@@ -15,13 +15,15 @@ import pytest
 from PIL import Image
 
 import clamber
-from clamber import io, viz
-from clamber.contact import ContactInterval, ContactSequence, Stance
+from clamber.contact.contact import ContactInterval, ContactSequence, Stance
 from clamber.errors import ClamberError, InputError
-from clamber.model import Kinematics, Robot
-from clamber.pipeline import Plan
-from clamber.scene import Box, Scene
-from clamber.simulation import Rollout
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import Robot
+from clamber.model.scene import Box, Scene
+from clamber.planning.records import Plan
+from clamber.run import folder as io
+from clamber.show import viz
 from conftest import contact
 
 SIZE = (160, 120)

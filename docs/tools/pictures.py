@@ -16,10 +16,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon, Rectangle
 
 import clamber
-from clamber.model import Kinematics
-from clamber.statics import support_ellipse, support_polygon
-from clamber.terrain import fitted_box
-from clamber.viz import Camera, finish_axes, mark_keyframe, save_plot, view_of
+from clamber.execution.terrain import fitted_box
+from clamber.model.kinematics import Kinematics
+from clamber.show.viz import Camera, finish_axes, mark_keyframe, save_plot, view_of
+from clamber.step.statics import support_ellipse, support_polygon
 
 mpl.rcParams.update({"font.size": 9, "axes.titlesize": 9, "savefig.dpi": 110})
 

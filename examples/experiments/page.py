@@ -12,10 +12,10 @@ import shutil
 import sys
 from pathlib import Path
 
-from clamber.curves import Summary, draw_success, summarise
-from clamber.experiment import strands
-from clamber.io import whole_file
-from clamber.sweep import load_sweep
+from clamber.run.folder import whole_file
+from clamber.study.curves import Summary, draw_success, summarise
+from clamber.study.spec import strands
+from clamber.study.sweep import load_sweep
 
 HERE = Path(__file__).parent
 ORDER = (

@@ -1,0 +1,1 @@
+"""Contacts, stances, sequences, steps, policies: what touches what, and when."""

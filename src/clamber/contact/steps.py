@@ -1,0 +1,165 @@
+"""A contact sequence as moves: one limb at a time changes its contact."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.model.world import World
+
+SAME_PLACE = 0.03  # [m] a contact made again nearer than this has not moved
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Move:
+    """One limb's change of contact.
+
+    Attributes:
+        limb: Its name.
+        breaks: Surfaces that leave their contacts.
+        makes: The contact that is made, its position a reference until optimised.
+        firm: The position is taken as it is, or as near as can be reached.
+    """
+
+    limb: str
+    breaks: tuple[str, ...]
+    makes: Contact | None
+    firm: bool = False
+
+    def __str__(self) -> str:
+        """Such as `LHand -> LElbow on box`."""
+        made = f"{self.makes.surface} on {self.makes.support}" if self.makes else "air"
+        return f"{', '.join(self.breaks) or 'air'} -> {made}"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Guide:
+    """Postures (nq,) near those that a move goes through, as far as they are known.
+
+    Attributes:
+        shifted: The weight on the contacts that stay.
+        touching: The new contact closed, not loaded.
+    """
+
+    shifted: np.ndarray | None = None
+    touching: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Step:
+    """A move, and the stance of the demonstration that it leads to.
+
+    Attributes:
+        stance: Index of the stance in the sequence; `target` is it.
+        move: What changes.
+        guide: Where its postures may be found.
+        base_rotation: (3, 3) R_WB of the pelvis that is preferred, or None.
+        reference: (nq,) the posture to stay close to; None: the one before.
+        rises: To the posture that the robot starts in, which goes before these: it is
+            the last step, and ends on the feet. A person who has just got up is bent,
+            and so is a robot that held on till then.
+    """
+
+    stance: int
+    target: Stance
+    move: Move
+    guide: Guide = Guide()
+    base_rotation: np.ndarray | None = None
+    reference: np.ndarray | None = None
+    rises: bool = False
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Skipped:
+    """A stance of the demonstration that is no keyframe, and why.
+
+    Attributes:
+        stance: Its index in the sequence.
+        reason: For people.
+        missed: A way was looked for and not found; otherwise there was nothing to do.
+    """
+
+    stance: int
+    reason: str
+    missed: bool = False
+
+
+def split_moves(
+    sequence: ContactSequence, world: World
+) -> tuple[list[Step], list[Skipped]]:
+    """Split each change of stance into moves of one limb, or say why there is none.
+
+    A limb that only leaves its contact is part of its next move where it has one. Where
+    two surfaces of a limb are down at once, the one nearer to the trunk bears the load.
+
+    Args:
+        sequence: In the robot's scene.
+        world: Robot and scene.
+    """
+    first = sequence.stances[0]
+    closed: dict[str, Contact | None] = {}
+    for limb in world.robot.limbs.values():
+        # The robot starts on its feet, wherever the recording's first stance is.
+        closed[limb.name] = None if limb.is_arm else first.contact(limb.surfaces[0])
+    standing = {x.name for x in world.robot.limbs.values() if not x.is_arm}
+    steps: list[Step] = []
+    skipped: list[Skipped] = []
+    for i, stance in enumerate(sequence.stances[1:], start=1):
+        reasons, before = [], len(steps)
+        for limb in world.robot.limbs.values():
+            wanted = [c for c in stance.contacts if c.surface in limb.surfaces]
+            has = closed[limb.name]
+            down = has.surface if has is not None else None
+            if limb.name in standing:
+                down = down or limb.surfaces[0]
+            if not wanted:
+                if down is None:
+                    continue
+                if _comes_back(sequence, i, limb.surfaces):
+                    side = limb.name.replace("_", " ")
+                    reasons.append(f"{side} in the air: part of its next move")
+                    continue
+                makes, breaks = None, (down,)
+            else:
+                makes = max(wanted, key=lambda c: limb.surfaces.index(c.surface))
+                if has is not None and same_place(has, makes):
+                    continue
+                if has is None and makes.surface == down:
+                    closed[limb.name] = makes
+                    continue
+                breaks = (down,) if down is not None else ()
+            closed[limb.name] = makes
+            standing.discard(limb.name)
+            firm = makes is not None and makes.firm
+            move = Move(limb=limb.name, breaks=breaks, makes=makes, firm=firm)
+            steps.append(Step(stance=i, target=stance, move=move))
+        if len(steps) == before:
+            reason = "; ".join(reasons) or "no limb makes or leaves a bearing contact"
+            skipped.append(Skipped(stance=i, reason=reason))
+    if steps:
+        last = [c for c in closed.values() if c is not None]
+        steps[-1] = replace(steps[-1], rises=on_feet(world, last))
+    return steps, skipped
+
+
+def on_feet(world: World, stance: Sequence[Contact]) -> bool:
+    """Whether a stance is one of feet alone: what ends so is meant to stand."""
+    limb_of = world.robot.limb_of
+    limbs = [(limb_of(c.surface), c.surface) for c in stance]
+    return bool(limbs) and all(
+        not limb.is_arm and surface == limb.surfaces[0] for limb, surface in limbs
+    )
+
+
+def same_place(a: Contact, b: Contact) -> bool:
+    """Whether a surface is where it was, within `SAME_PLACE`."""
+    near = float(np.linalg.norm(a.position - b.position)) < SAME_PLACE
+    return a.surface == b.surface and a.support == b.support and near
+
+
+def _comes_back(sequence: ContactSequence, i: int, surfaces: tuple[str, ...]) -> bool:
+    later = sequence.stances[i + 1 :]
+    return any(c.surface in surfaces for s in later for c in s.contacts)

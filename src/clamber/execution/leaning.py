@@ -1,0 +1,121 @@
+"""Contact forces as felt -> the part of the robot that bears where it should not.
+
+What the surfaces bear is less than the weight: another part bears the rest. Motion is
+slow, so forces and moments balance, those of gravity, of the surfaces and of that part:
+
+    F = -(m g + sum f_i),        p x F = -(c x m g + sum p_i x f_i).
+
+The second says where on a plane the line of F passes, up to what the noise of the
+forces leaves, a few centimetres, and up to where on its sole a foot is borne, which is
+not felt. That tells one arm from the other, and the part is the one that comes nearest
+to a support there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from clamber.model.kinematics import Kinematics
+
+MISSING = 0.08  # of the weight that the surfaces do not bear
+SIDEWAYS = 15.0  # [N] and more than the force upwards: a surface strikes a side
+SEARCHED = 0.06  # [m] a support is believed no farther from what leans on it
+AWAY = 0.20  # [m] from the line of the force, besides what soles leave open
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Lean:
+    """What leans on what.
+
+    Attributes:
+        geom: Of the robot, in the model.
+        support: Name.
+        distance: Between them as believed [m]; really 0.
+    """
+
+    geom: int
+    support: str
+    distance: float
+
+
+def is_leaning(load: np.ndarray, weight: float) -> bool:
+    """Whether forces (nS, 3) of the surfaces [N] are less than the weight [N]."""
+    return weight - load[:, 2].sum() > MISSING * weight
+
+
+def strikes(load: np.ndarray) -> np.ndarray:
+    """(nS,) bool: a surface is pushed sideways more than upwards, forces (nS, 3) [N].
+
+    No contact on a level support bears like that, at a friction of up to 1.
+    """
+    sideways = np.hypot(load[:, 0], load[:, 1])
+    return sideways > np.maximum(SIDEWAYS, load[:, 2])
+
+
+def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | None:
+    """The part, none of the surfaces, that bears what these do not.
+
+    Args:
+        kin: In the posture as measured, of the world as believed.
+        load: (nS, 3) forces on the surfaces [N], world axes.
+        weight: Of the robot [N].
+
+    Returns:
+        None where no part is near a support on the line of the force.
+    """
+    world = kin.world
+    down = np.array([0.0, 0.0, -weight])
+    points = [kin.contact_point(s, UP) for s in world.surfaces]
+    force = -(down + load.sum(axis=0))
+    moment = -(np.cross(kin.com, down) + np.cross(points, load).sum(axis=0))
+    open_ = _moment_of_soles(kin, load) / max(force[2], 1e-9)
+    own = [g for s in world.surfaces.values() for g in s.geoms]
+    best, found = SEARCHED + AWAY, None
+    for lean, p in _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) == 0):
+        # p x F = M in the plane z = p_z.
+        x = (p[2] * force[0] - moment[1]) / force[2]
+        y = (p[2] * force[1] + moment[0]) / force[2]
+        away = max(float(np.hypot(x - p[0], y - p[1])) - open_, 0.0)
+        if away < AWAY and max(lean.distance, 0.0) + away < best:
+            best, found = max(lean.distance, 0.0) + away, lean
+    return found
+
+
+def _moment_of_soles(kin: Kinematics, load: np.ndarray) -> float:
+    """The most that forces (nS, 3) turn about the middles of flat surfaces [N m]."""
+    half = [  # 0 of a ball
+        np.linalg.norm(s.corners - s.centre, axis=1).max()
+        for s in kin.world.surfaces.values()
+    ]
+    return float(np.maximum(load[:, 2], 0.0) @ half)
+
+
+def striking_part(kin: Kinematics, surfaces: Collection[str]) -> Lean | None:
+    """The geom of some surfaces that is nearest to a support; None where none is."""
+    world = kin.world
+    own = [g for s in surfaces for g in world.surfaces[s].geoms]
+    near = _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) > 0)
+    return min((lean for lean, _ in near), key=lambda x: x.distance, default=None)
+
+
+def _near_supports(
+    kin: Kinematics, active: np.ndarray
+) -> list[tuple[Lean, np.ndarray]]:
+    """Parts near a support among pairs (P,), each with its nearest point (3,)."""
+    world = kin.world
+    supports = list(world.support_of_geom)
+    of_support = np.isin(world.pairs, supports)
+    near = kin.proximity(SEARCHED, active & (of_support.sum(axis=1) == 1))
+    out = []
+    for k, distance, a, b in zip(
+        near.pairs, near.distance, near.first, near.second, strict=True
+    ):
+        first = int(of_support[k, 0])  # the robot's is the other one
+        geom, other = int(world.pairs[k, first]), int(world.pairs[k, 1 - first])
+        lean = Lean(geom, world.support_of_geom[other], float(distance))
+        out.append((lean, b if first else a))
+    return out

@@ -1,0 +1,1 @@
+"""A robot, a scene, and the one MuJoCo world they make."""

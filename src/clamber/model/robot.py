@@ -1,0 +1,292 @@
+"""robot.yaml -> Robot: what a planner must know beyond an MJCF or URDF.
+
+Which geoms are surfaces, which chain is a limb, where it stands at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Literal
+
+import mujoco
+import numpy as np
+import pydantic
+
+from clamber.errors import InputError
+from clamber.model.description import Description, compile_description, read_description
+from clamber.model.scene import input_error, read_yaml
+
+ROBOTS = Path(__file__).parent / "robots"
+LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
+
+
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+
+class LimbFile(_Strict):
+    """One of `limbs` of a robot file: landmarks are bodies, else geoms."""
+
+    root: str
+    middle: str
+    end: str
+    surfaces: list[str]
+
+
+class GainsFile(_Strict):
+    """Joint gains: [N m/rad], [N m s/rad], [N m/(rad s)]."""
+
+    kp: float = pydantic.Field(default=600.0, gt=0)
+    kd: float = pydantic.Field(default=20.0, ge=0)
+    ki: float = pydantic.Field(default=9.0, ge=0)
+
+
+class ImpedanceFile(_Strict):
+    """Stiffness and damping of a compliant joint: [N m/rad], [N m s/rad]."""
+
+    kp: float = pydantic.Field(gt=0)
+    kd: float = pydantic.Field(ge=0)
+
+
+class RobotFile(_Strict):
+    """A robot as a person writes it (`robot.yaml`)."""
+
+    version: int = 1
+    name: str
+    model: str
+    base: str
+    home: dict[str, float] = {}
+    limbs: dict[Literal["left_arm", "right_arm", "left_leg", "right_leg"], LimbFile]
+    surfaces: dict[str, str] = {}
+    effort: dict[str, Annotated[float, pydantic.Field(gt=0)]] = {}
+    gains: dict[str, GainsFile] = {"default": GainsFile()}
+    impedance: dict[str, ImpedanceFile] = {}
+    self_positioning: list[str] = []
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Limb:
+    """A chain with its surfaces; `root` is the mass that its contacts support."""
+
+    name: str
+    root: str
+    middle: str
+    end: str
+    surfaces: tuple[str, ...]
+
+    @property
+    def is_arm(self) -> bool:
+        """Arms carry the shoulders, legs the hips."""
+        return self.name.endswith("arm")
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Robot:
+    """A humanoid as its files describe it.
+
+    Attributes:
+        path: The MJCF or URDF file.
+        base: Name of the pelvis body.
+        home: Joint angles of the posture it starts from [rad].
+        limbs: By name, from `LIMBS`.
+        prefixes: Prefix of the geom names of each surface.
+        effort: Largest torque [N m] of joints whose description has none, or another.
+        gains: (kp, kd, ki) by joint name, and `default`.
+        impedance: (kp, kd) of the joints that mixed control makes compliant (4.31).
+        self_positioning: Joints that follow their terrain while the arms bear load
+            (4.32): the ankles.
+    """
+
+    name: str
+    path: Path
+    base: str
+    home: Mapping[str, float]
+    limbs: Mapping[str, Limb]
+    prefixes: Mapping[str, str]
+    gains: Mapping[str, tuple[float, float, float]]
+    effort: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    impedance: Mapping[str, tuple[float, float]] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
+    self_positioning: tuple[str, ...] = ()
+
+    @property
+    def surfaces(self) -> tuple[str, ...]:
+        """Names of all surfaces, limb by limb."""
+        return tuple(s for limb in self.limbs.values() for s in limb.surfaces)
+
+    def limb_of(self, surface: str) -> Limb:
+        """The limb that bears a surface."""
+        for limb in self.limbs.values():
+            if surface in limb.surfaces:
+                return limb
+        raise KeyError(f"no surface {surface!r}; there are {list(self.surfaces)}")
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Read a built-in robot by name, or a `robot.yaml`.
+
+    Raises:
+        InputError: No such robot, or a field of its file cannot be used.
+    """
+    path = Path(name_or_path)
+    if not path.suffix:
+        known = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))
+        if str(name_or_path) not in known:
+            raise InputError(
+                f"a robot.yaml, or one of {', '.join(known)}",
+                source="--robot",
+                value=str(name_or_path),
+            )
+        path = ROBOTS / str(name_or_path) / "robot.yaml"
+    elif path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            "a robot.yaml beside the model, which names its limbs and surfaces",
+            source="--robot",
+            value=str(path),
+        )
+    try:
+        file = RobotFile.model_validate(read_yaml(path))
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    missing = set(LIMBS) - set(file.limbs)
+    if missing:
+        raise InputError(
+            "all four limbs", source=path, field="limbs", value=sorted(missing)
+        )
+    model_path = path.parent / file.model
+    if not model_path.is_file():
+        raise InputError(
+            "an MJCF or URDF file", source=path, field="model", value=file.model
+        )
+    limbs = {
+        n: Limb(
+            name=n, root=f.root, middle=f.middle, end=f.end, surfaces=tuple(f.surfaces)
+        )
+        for n in LIMBS
+        for f in (file.limbs[n],)
+    }
+    gains = {"default": GainsFile(), **file.gains}
+    robot = Robot(
+        name=file.name,
+        path=model_path,
+        base=file.base,
+        home=dict(file.home),
+        limbs=limbs,
+        prefixes={
+            s: file.surfaces.get(s, s) for limb in limbs.values() for s in limb.surfaces
+        },
+        effort=dict(file.effort),
+        gains={n: (g.kp, g.kd, g.ki) for n, g in gains.items()},
+        impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
+        self_positioning=tuple(file.self_positioning),
+    )
+    _check(robot, path)
+    return robot
+
+
+def _check(robot: Robot, source: Path) -> None:
+    """Compile the robot alone and look up every name that its file mentions."""
+    description = read_description(robot.path)
+    model = compile_description(description, robot.path)
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    geoms = {model.geom(i).name for i in range(model.ngeom)}
+    joints = {model.joint(i).name for i in range(model.njnt)}
+    if robot.base not in bodies:
+        raise InputError(
+            f"a body of {robot.path.name}",
+            source=source,
+            field="base",
+            value=robot.base,
+        )
+    named = {
+        "home": robot.home,
+        "effort": robot.effort,
+        "gains": [n for n in robot.gains if n != "default"],
+        "impedance": robot.impedance,
+        "self_positioning": robot.self_positioning,
+    }
+    for where, names in named.items():
+        for name in names:
+            if name not in joints:
+                raise InputError(
+                    f"a joint of {robot.path.name}",
+                    source=source,
+                    field=where,
+                    value=name,
+                )
+    _check_joints(robot, model, description, source)
+    for limb in robot.limbs.values():
+        for place in ("root", "middle", "end"):
+            if getattr(limb, place) not in bodies | geoms | set(robot.surfaces):
+                raise InputError(
+                    f"a body or geom of {robot.path.name}",
+                    source=source,
+                    field=f"limbs.{limb.name}.{place}",
+                    value=getattr(limb, place),
+                )
+        for s in limb.surfaces:
+            if not any(has_prefix(g, robot.prefixes[s]) for g in geoms):
+                raise InputError(
+                    f"a surface that geoms of {robot.path.name} bear by the prefix"
+                    f" {robot.prefixes[s]!r}",
+                    source=source,
+                    field=f"limbs.{limb.name}.surfaces",
+                    value=s,
+                )
+
+
+def _check_joints(
+    robot: Robot, model: mujoco.MjModel, description: Description, source: Path
+) -> None:
+    """Hinges with effort limits, each on its own, below one floating base."""
+    kinds = mujoco.mjtJoint
+    for j in range(model.njnt):
+        name, kind = model.joint(j).name, kinds(int(model.jnt_type[j]))
+        if kind == kinds.mjJNT_FREE:
+            owner = model.body(int(model.jnt_bodyid[j])).name
+            if owner != robot.base:
+                raise InputError(
+                    f"the body that floats, {owner}",
+                    source=source,
+                    field="base",
+                    value=robot.base,
+                )
+            continue
+        if kind != kinds.mjJNT_HINGE:
+            raise InputError(
+                "hinges alone; lock other joints by leaving them out",
+                source=robot.path,
+                field=f"joint {name!r}",
+                value=kind.name.removeprefix("mjJNT_").lower(),
+            )
+        if name in description.mimics:
+            raise InputError(
+                "joints that move on their own (it follows"
+                f" {description.mimics[name]!r}): leave it out",
+                source=robot.path,
+                field=f"joint {name!r}",
+            )
+        if name not in robot.effort and not np.any(model.jnt_actfrcrange[j]):
+            raise InputError(
+                "its largest torque [N m]: the description has none"
+                " (actuatorfrcrange, or a URDF's effort)",
+                source=source,
+                field=f"effort.{name}",
+            )
+
+
+def has_prefix(geom: str, prefix: str) -> bool:
+    """Whether a geom bears a name, alone or with a suffix."""
+    return geom == prefix or geom.startswith(prefix + "_")
+
+
+def world_name(robot: Robot, geom: str) -> str:
+    """The name that a geom of the description has in the world."""
+    for surface, prefix in robot.prefixes.items():
+        if prefix != surface and has_prefix(geom, prefix):
+            return surface + geom.removeprefix(prefix)
+    return geom

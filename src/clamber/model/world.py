@@ -1,0 +1,521 @@
+"""Robot and world: one MuJoCo model serves planning and physics.
+
+A `Robot` is a description (MJCF or URDF) with what a planner must know beyond it: which
+geoms are surfaces, which chain is a limb, where it stands at the start. `World` is
+robot and scene compiled together; `Kinematics` is a configuration of it for which
+forward kinematics have been run.
+
+Shapes: nq, nv of the world's model; na actuated joints; the first 7 of `q` and 6 of `v`
+are the floating base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from clamber.errors import InputError
+from clamber.model.description import read_description
+from clamber.model.robot import Robot, has_prefix, world_name
+from clamber.model.scene import GROUND, Scene, Support
+from clamber.model.se3 import matrix_from_quat
+
+PHYSICS_STEP = 0.001  # [s]
+SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
+IMPRATIO = 10.0  # friction stiffer than normal force: no creep while standing
+BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
+CLEAR = 0.002  # [m] that they keep from boxes at the start
+DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
+DEFAULT_DAMPING = 3.0  # [N m s/rad] where the description has none
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Surface:
+    """Contact geometry of a surface, in the frame of its one body.
+
+    Attributes:
+        body: Body id.
+        geoms: Ids of all its geoms.
+        centre: (3,) point surface: centre of the ball; flat one: middle of the face.
+        radius: Radius of the ball; 0 for a flat surface.
+        rotation: (3, 3) R_BC of a flat surface in contact: z into the link, x along its
+            length; None for a point surface.
+        corners: (K, 3) points that can bear force (K = 1 or 4), ball centres or
+        corners.
+    """
+
+    name: str
+    body: int
+    geoms: tuple[int, ...]
+    centre: np.ndarray
+    radius: float
+    rotation: np.ndarray | None
+    corners: np.ndarray
+
+    @property
+    def is_flat(self) -> bool:
+        """A flat surface fixes orientation, a point surface does not."""
+        return self.rotation is not None
+
+    def edge(self, i: int) -> Surface:
+        """Edge `i` of a flat surface, from corner i to the next, as a surface."""
+        ends = self.corners[[i, (i + 1) % len(self.corners)]]
+        return replace(self, centre=ends.mean(axis=0), corners=ends)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class World:
+    """Robot and scene as one compiled model, with indices and limits.
+
+    Attributes:
+        xml: The MJCF text, geoms of surfaces renamed to begin with the surface's name.
+        home: (nq,) standing at the scene's start, soles on the ground.
+        q_min, q_max: (nv,) joint limits aligned with `v`; infinite for the base.
+        v_max: (nv,) speed limits; infinite for the base.
+        tau_max: (na,) effort limits; joints: (na,) names.
+        qadr, dadr: (na,) indices of the actuated joints in q and v.
+        pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
+        support_geom: Geom of each support; support_of_geom: the other way, with the
+            tiles of an uneven top.
+        touching: By surface and support, the pairs that touch in their contact: those
+            that plan it, and those of the surface's further geoms.
+    """
+
+    model: mujoco.MjModel
+    xml: str
+    assets: Mapping[str, bytes]
+    robot: Robot
+    scene: Scene
+    home: np.ndarray
+    surfaces: Mapping[str, Surface]
+    edges: Mapping[str, tuple[Surface, ...]]
+    joints: tuple[str, ...]
+    qadr: np.ndarray
+    dadr: np.ndarray
+    q_min: np.ndarray
+    q_max: np.ndarray
+    tau_max: np.ndarray
+    v_max: np.ndarray
+    kp: np.ndarray
+    kd: np.ndarray
+    ki: np.ndarray
+    pairs: np.ndarray
+    support_geom: Mapping[str, int]
+    support_of_geom: Mapping[int, str]
+    supports: Mapping[str, Support]
+    touching: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
+    base: int
+    mass: float
+
+    def surface(self, name: str, edge: int | None = None) -> Surface:
+        """A surface, or one edge of it where it has rolled onto that."""
+        return self.surfaces[name] if edge is None else self.edges[name][edge]
+
+    def landmark(self, name: str) -> tuple[int, np.ndarray]:
+        """Body id and point (3,) in its frame of a body or, failing that, a geom."""
+        b = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
+        if b >= 0:
+            return b, np.zeros(3)
+        if name in self.surfaces:
+            return self.surfaces[name].body, self.surfaces[name].centre
+        g = self.model.geom(world_name(self.robot, name)).id
+        return int(self.model.geom_bodyid[g]), self.model.geom_pos[g].copy()
+
+
+def build_world(robot: Robot, scene: Scene) -> World:
+    """Compile robot and scene into one model, the robot standing at the start.
+
+    Actuators of the description are replaced by one joint servo per hinge, saturated at
+    its effort limit. Supports have contact priority, so that their friction counts.
+    """
+    spec = read_description(robot.path).spec
+    _prepare_robot(spec, robot)
+    spec.option.timestep = PHYSICS_STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = IMPRATIO
+    spec.option.gravity = [0, 0, -9.81]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.quality.shadowsize = 4096
+    _add_scene(spec, scene)
+    spec.compile()
+    xml = spec.to_xml()
+    # Written numbers are rounded: plan with what a reader of the file will simulate.
+    again = mujoco.MjSpec.from_string(xml)
+    again.modelfiledir = str(robot.path.parent)
+    model = again.compile()
+    return index_world(model, xml, robot, scene)
+
+
+def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Free joint at the pelvis, servos on the hinges, geoms by surfaces' names."""
+    for a in list(spec.actuators):
+        spec.delete(a)
+    for k in list(spec.keys):
+        spec.delete(k)
+    base = spec.body(robot.base)
+    if not any(j.type == mujoco.mjtJoint.mjJNT_FREE for j in base.joints):
+        base.add_freejoint(name="root")
+    for g in spec.geoms:
+        g.name = world_name(robot, g.name)
+    for j in spec.joints:
+        if j.type != mujoco.mjtJoint.mjJNT_HINGE:
+            continue
+        if np.max(j.armature) <= 0:
+            j.armature = DEFAULT_ARMATURE
+        if np.max(j.damping) <= 0:
+            j.damping = [DEFAULT_DAMPING, 0, 0]
+        kp, kd, _ = robot.gains.get(j.name, robot.gains["default"])
+        a = spec.add_actuator(name=j.name, target=j.name)
+        a.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        a.set_to_position(kp=kp, kv=kd)
+        limit = float(np.max(np.abs(j.actfrcrange)))
+        if j.name in robot.effort:
+            limit = robot.effort[j.name]
+            j.actfrcrange = [-limit, limit]
+            j.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        a.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+        a.forcerange = [-limit, limit]
+
+
+def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
+    """Ground plane, boxes and lights."""
+    spec.add_texture(
+        name="clamber_ground",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        width=256,
+        height=256,
+        rgb1=[0.86, 0.87, 0.88],
+        rgb2=[0.80, 0.81, 0.83],
+    )
+    material = spec.add_material(
+        name="clamber_ground", texrepeat=[2, 2], texuniform=True
+    )
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "clamber_ground"
+    spec.add_texture(
+        name="clamber_sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=128,
+        height=768,
+        rgb1=[0.93, 0.95, 0.97],
+        rgb2=[0.75, 0.80, 0.86],
+    )
+    world = spec.worldbody
+    light = world.add_light(
+        pos=[-1.0, -2.0, 4.0], dir=[0.35, 0.5, -1.0], castshadow=True
+    )
+    light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    light.diffuse = [0.6, 0.6, 0.6]
+    common = {"priority": 1, "solref": [*SOLREF], "condim": 4}
+    world.add_geom(
+        name=GROUND,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        friction=[scene.ground_friction, 0.02, 0.001],
+        material="clamber_ground",
+        **common,
+    )
+    for b in scene.boxes:
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, np.ascontiguousarray(b.rotation).ravel())
+        world.add_geom(
+            name=b.name,
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=b.size / 2,
+            pos=b.position,
+            quat=quat,
+            friction=[b.friction, 0.02, 0.001],
+            rgba=[0.76, 0.60, 0.42, 1.0],
+            **common,
+        )
+
+
+def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World:
+    """The world of a compiled model, everything looked up once.
+
+    Args:
+        model: Of `xml`.
+        xml: As `build_world` wrote it.
+        robot: That is in it.
+        scene: That is around it.
+    """
+    base = model.body(robot.base).id
+    hinges = [
+        j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
+    qadr, dadr = model.jnt_qposadr[hinges].copy(), model.jnt_dofadr[hinges].copy()
+    q_min, q_max = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    for j in hinges:
+        if model.jnt_limited[j]:
+            q_min[model.jnt_dofadr[j]], q_max[model.jnt_dofadr[j]] = model.jnt_range[j]
+    joints = tuple(model.joint(j).name for j in hinges)
+    tau_max = np.array([model.actuator(n).forcerange[1] for n in joints])
+    gains = np.array([robot.gains.get(n, robot.gains["default"]) for n in joints])
+    data = mujoco.MjData(model)
+    home = model.qpos0.copy()
+    for name, angle in robot.home.items():
+        home[model.joint(name).qposadr[0]] = angle
+    data.qpos[:] = home
+    mujoco.mj_kinematics(model, data)
+    surfaces = {s: _surface(model, data, s) for s in robot.surfaces}
+    pairs = _pairs(model, data, base)
+    home = _stand_clear(model, data, robot, scene, home, surfaces, pairs)
+    return World(
+        model=model,
+        xml=xml,
+        assets={},
+        robot=robot,
+        scene=scene,
+        home=home,
+        surfaces=surfaces,
+        edges={
+            n: tuple(s.edge(i) for i in range(len(s.corners))) if s.is_flat else ()
+            for n, s in surfaces.items()
+        },
+        joints=joints,
+        qadr=qadr,
+        dadr=dadr,
+        q_min=q_min,
+        q_max=q_max,
+        tau_max=tau_max,
+        v_max=np.full(model.nv, np.inf),
+        kp=gains[:, 0],
+        kd=gains[:, 1],
+        ki=gains[:, 2],
+        pairs=pairs,
+        support_geom={s.name: model.geom(s.name).id for s in scene.supports},
+        support_of_geom={
+            g: s.name
+            for s in scene.supports
+            for g in range(model.ngeom)
+            if model.geom_bodyid[g] == 0
+            and (model.geom(g).name == s.name or has_prefix(model.geom(g).name, s.name))
+        },
+        supports={s.name: s for s in scene.supports},
+        touching={
+            (name, s.name): _touching(model, pairs, surface, model.geom(s.name).id)
+            for name, surface in surfaces.items()
+            for s in scene.supports
+        },
+        base=base,
+        mass=float(model.body_subtreemass[base]),
+    )
+
+
+def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
+    """Contact geometry from the geoms that bear the surface's name.
+
+    The geom with the bare name (else the first) is the one that plans: a sphere is a
+    point surface, a capsule one at its lower end, a box or any other a flat surface,
+    its face the one that looks down at home.
+    """
+    geoms = [g for g in range(model.ngeom) if has_prefix(model.geom(g).name, name)]
+    main = next((g for g in geoms if model.geom(g).name == name), geoms[0])
+    body = int(model.geom_bodyid[main])
+    bodies = {int(model.geom_bodyid[g]) for g in geoms}
+    if len(bodies) > 1:
+        raise InputError(
+            "one body for each surface",
+            field=name,
+            value=sorted(model.body(b).name for b in bodies),
+        )
+    kind, size = mujoco.mjtGeom(int(model.geom_type[main])), model.geom_size[main]
+    p_BG, R_BG = model.geom_pos[main].copy(), matrix_from_quat(model.geom_quat[main])
+    R_WB = data.xmat[body].reshape(3, 3)
+    if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+        if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            ends = p_BG + np.outer([-1.0, 1.0], R_BG[:, 2] * size[1])
+            p_BG = ends[np.argmin((ends @ R_WB.T)[:, 2])]
+        return Surface(
+            name=name,
+            body=body,
+            geoms=tuple(geoms),
+            centre=p_BG,
+            radius=float(size[0]),
+            rotation=None,
+            corners=p_BG[None],
+        )
+    if kind != mujoco.mjtGeom.mjGEOM_BOX:
+        p_BG = p_BG + R_BG @ model.geom_aabb[main, :3]
+        size = model.geom_aabb[main, 3:]
+    down = (R_WB @ R_BG)[2]  # world's z in the geom's frame
+    axis = int(np.argmax(np.abs(down)))
+    sign = -np.sign(down[axis])  # the outward face looks down
+    normal = np.zeros(3)
+    normal[axis] = -sign
+    rest = [i for i in range(3) if i != axis]
+    length = max(rest, key=lambda i: size[i])
+    x = np.zeros(3)
+    x[length] = np.sign((R_WB @ R_BG)[0, length]) or 1.0
+    R_GC = np.stack([x, np.cross(normal, x), normal], axis=1)
+    other = next(i for i in rest if i != length)
+    half = np.zeros(3)
+    half[axis] = sign * size[axis]
+    centre = p_BG + R_BG @ half
+    corners = []
+    for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
+        offset = half.copy()
+        offset[length], offset[other] = a * size[length], b * size[other]
+        corners.append(p_BG + R_BG @ offset)
+    return Surface(
+        name=name,
+        body=body,
+        geoms=tuple(geoms),
+        centre=centre,
+        radius=0.0,
+        rotation=R_BG @ R_GC,
+        corners=np.array(corners),
+    )
+
+
+def _stand(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    robot: Robot,
+    scene: Scene,
+    home: np.ndarray,
+    surfaces: Mapping[str, Surface],
+) -> np.ndarray:
+    """Put the ankles' midpoint at the start and the soles on the ground."""
+    ends = [robot.limbs[n].end for n in ("left_leg", "right_leg")]
+    low, ankles = np.inf, []
+    for name in ends:
+        if (b := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0:
+            ankles.append(data.xpos[b])
+        elif foot := surfaces.get(name):
+            R_WB = data.xmat[foot.body].reshape(3, 3)
+            ankles.append(data.xpos[foot.body] + R_WB @ foot.centre)
+        else:
+            ankles.append(data.geom(world_name(robot, name)).xpos)
+    for s in surfaces.values():
+        z = data.xpos[s.body] + s.corners @ data.xmat[s.body].reshape(3, 3).T
+        low = min(low, float(z[:, 2].min() - s.radius))
+    x, y, yaw = scene.start
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    mid = np.mean(ankles, axis=0)
+    out = home.copy()
+    out[:3] = R @ (home[:3] - [mid[0], mid[1], low]) + [x, y, 0.0]
+    turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+    mujoco.mju_mulQuat(out[3:7], turn, home[3:7])
+    return out
+
+
+def _stand_clear(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    robot: Robot,
+    scene: Scene,
+    home: np.ndarray,
+    surfaces: Mapping[str, Surface],
+    pairs: np.ndarray,
+) -> np.ndarray:
+    """Stand at the start, the legs straighter where bent knees would be in a box.
+
+    Where they are in it even so, the posture is that of `home`.
+    """
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    boxes = pairs[(fixed & ~plane)[pairs].any(axis=1)]
+    legs, fromto = _leg_joints(model, robot, surfaces), np.zeros(6)
+    tried = []
+    for bend in BENDS:
+        bent = home.copy()
+        bent[model.jnt_qposadr[legs]] *= bend
+        data.qpos[:] = bent
+        mujoco.mj_kinematics(model, data)
+        posture = _stand(model, data, robot, scene, bent, surfaces)
+        data.qpos[:] = posture
+        mujoco.mj_kinematics(model, data)
+        if all(
+            mujoco.mj_geomDistance(model, data, int(a), int(b), CLEAR, fromto) >= CLEAR
+            for a, b in boxes
+        ):
+            return posture
+        tried.append(posture)
+    return tried[0]
+
+
+def chain_up(model: mujoco.MjModel, body: int, top: int = 0) -> list[int]:
+    """A body and those it hangs on, up to `top` or the world, which are left out."""
+    chain = []
+    while body not in (0, top):
+        chain.append(body)
+        body = int(model.body_parentid[body])
+    return chain
+
+
+def limb_links(world: World, surface: str) -> set[int]:
+    """Bodies of the limb of a surface, from below its root to its surfaces."""
+    limb = world.robot.limb_of(surface)
+    root = world.landmark(limb.root)[0]
+    out = set()
+    for s in limb.surfaces:
+        out.update(chain_up(world.model, world.surfaces[s].body, root))
+    return out
+
+
+def _leg_joints(
+    model: mujoco.MjModel, robot: Robot, surfaces: Mapping[str, Surface]
+) -> list[int]:
+    """Hinges between the base and the soles."""
+    base, links = model.body(robot.base).id, set()
+    for limb in robot.limbs.values():
+        if not limb.is_arm:
+            links.update(chain_up(model, surfaces[limb.surfaces[0]].body, base))
+    return [
+        j
+        for j in range(model.njnt)
+        if int(model.jnt_bodyid[j]) in links
+        and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+    ]
+
+
+def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
+    """Geom pairs whose contacts MuJoCo would compute and that are apart at home."""
+    robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[base]
+    excluded = set(model.exclude_signature.tolist())
+    fromto = np.zeros(6)
+    out = []
+    for a in range(model.ngeom):
+        for b in range(a + 1, model.ngeom):
+            if not (robot[a] or robot[b]):
+                continue
+            masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
+                model.geom_contype[b] & model.geom_conaffinity[a]
+            )
+            ba, bb = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
+            wa, wb = int(model.body_weldid[ba]), int(model.body_weldid[bb])
+            if not masks or wa == wb:
+                continue
+            if robot[a] and robot[b]:
+                parents = (
+                    model.body_weldid[model.body_parentid[wa]],
+                    model.body_weldid[model.body_parentid[wb]],
+                )
+                if wb == parents[0] or wa == parents[1]:
+                    continue
+                lo, hi = min(ba, bb), max(ba, bb)
+                if (lo << 16) + hi in excluded or (hi << 16) + lo in excluded:
+                    continue
+                if mujoco.mj_geomDistance(model, data, a, b, 1.0, fromto) <= 0:
+                    continue
+            out.append((a, b))
+    return np.array(out, dtype=np.int32).reshape(-1, 2)
+
+
+def _touching(
+    model: mujoco.MjModel, pairs: np.ndarray, surface: Surface, support: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the pairs of a surface with a support's geom: planned, further."""
+    mine = np.isin(pairs, surface.geoms).any(axis=1)
+    here = mine & (pairs == support).any(axis=1)
+    main = [g for g in surface.geoms if model.geom(g).name == surface.name]
+    planned = np.isin(pairs, main).any(axis=1) | surface.is_flat
+    return np.flatnonzero(here & planned), np.flatnonzero(here & ~planned)

@@ -1,0 +1,1 @@
+"""Which contacts, when: search, proposals, timing -> plan."""

@@ -1,0 +1,498 @@
+"""Which contacts, where the demonstrated ones do not lead there: a best-first search.
+
+A state is a stance with its posture, and the paths that lead to it; an action moves one
+limb to a contact: a surface of it, on a support, at a place. An action costs
+
+    -ln p(surface | region)  +  max(0, r - 1)
+
+with p how often a demonstration takes it in such a region (what it never does is
+unlikely, not out of the question), and r the distance from shoulder or hip to the
+place, in lengths of the limb. What is left to do is reckoned from the limbs that have
+yet to get to where the demonstration ends, and from how far away they are. The least
+sum of both comes first. Whether a step is possible is known when it has been planned;
+only what comes first is.
+"""
+
+from __future__ import annotations
+
+import enum
+import heapq
+import itertools
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from clamber.contact.contact import Contact, ContactSequence, Region, Stance, region_of
+from clamber.contact.policy import GeneralPolicy
+from clamber.contact.scaling import near_edge
+from clamber.contact.steps import Move, Step, on_feet, split_moves
+from clamber.errors import InputError
+from clamber.model.kinematics import Kinematics
+from clamber.model.scene import GROUND
+from clamber.model.se3 import quat_from_matrix
+from clamber.model.world import World
+from clamber.planning.records import PlanOptions, Progress
+from clamber.step.change import plan_step, standing
+from clamber.step.ik import IK
+from clamber.step.path import Path
+from clamber.step.posture import STANDING_SHARE, Keyframe, standing_share
+
+Counts = Mapping[tuple[Region, str], float]
+
+SAME_PLACE = 0.08  # [m] a surface that comes down nearer to where it was has not moved
+INSET = 0.05  # [m] of a place from the border of its support
+TRUNK_GIVE = 1.1  # a bent waist: longest over present distance of shoulders and hips
+FAR = 0.25  # of what a limb has left: each length of it that it is away
+AGAIN = 0.7  # cost of each step to the same surfaces on the same supports before
+EAGER = 1.25  # weight of what is left: a sequence soon rather than the likeliest
+UNSEEN = 0.25  # times that every action counts as seen besides
+CELL = 0.05  # [m] contacts as near to one another make the same state
+GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
+BACK_TOL = 0.30  # [m] mean of the contacts, where the way leads back to where it began
+
+
+class Stop(enum.Enum):
+    """Why a search ended: a sentence."""
+
+    FOUND = "a sequence was found"
+    EXHAUSTED = "there is no sequence within the bounds: every state was expanded"
+    TRIES = "the bound on steps to plan was reached: allow more"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bounds:
+    """How far a search for contacts goes.
+
+    Attributes:
+        tries: Steps that it plans at most; 0: none, there is no search. A step takes
+            from a tenth of a second to two seconds.
+        depth: Moves that it adds at most.
+    """
+
+    tries: int = 100
+    depth: int = 12
+
+    def __post_init__(self) -> None:
+        """Check that they are bounds.
+
+        Raises:
+            InputError: One of them is negative.
+        """
+        for name in ("tries", "depth"):
+            if getattr(self, name) < 0:
+                value = getattr(self, name)
+                raise InputError("0 or more", field=f"search.{name}", value=value)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Explored:
+    """What a search for contacts found.
+
+    Attributes:
+        keyframes: The start first; one more for each path. Where nothing was found,
+            those that it went on from.
+        paths: Between them.
+        sequence: Of the stances found, a robot's own; None where nothing was found.
+        states: That were expanded.
+        tries: Steps that were planned.
+        stop: Why it ended.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    paths: tuple[Path, ...]
+    sequence: ContactSequence | None
+    states: int
+    tries: int
+    stop: Stop
+
+
+def policy_counts(policy: GeneralPolicy) -> Counts:
+    """How often the demonstrations of a policy take each action in each region."""
+    return Counter(
+        (state.region, action)
+        for demo in policy.demos
+        for state, action in zip(demo.states, demo.actions, strict=False)
+        if action is not None
+    )
+
+
+def action_counts(sequence: ContactSequence, world: World) -> Counts:
+    """How often each surface makes a contact in each region, in a sequence.
+
+    Args:
+        sequence: In the robot's scene.
+        world: Robot and scene.
+    """
+    counts: Counter[tuple[Region, str]] = Counter()
+    stance = sequence.stances[0].contacts
+    for step in split_moves(sequence, world)[0]:
+        if step.move.makes is not None:
+            counts[region_of(stance), step.move.makes.surface] += 1
+        stance = _after(stance, step.move)
+    return counts
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Reached:
+    """A stance that is reached, and how.
+
+    Attributes:
+        keyframes: The start first; one more for each path.
+        paths: Between them; steps: that they make.
+        cost: Of the actions.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    paths: tuple[Path, ...] = ()
+    steps: tuple[Step, ...] = ()
+    cost: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Action:
+    step: Step
+    price: float
+
+
+@dataclass(order=True, slots=True)
+class _Entry:
+    priority: float
+    order: int
+    state: Reached = field(compare=False)
+    action: _Action = field(compare=False)
+
+
+def explore(
+    ik: IK,
+    sequence: ContactSequence,
+    options: PlanOptions,
+    counts: Counts,
+    bounds: Bounds,
+    *,
+    start: Reached | None = None,
+    report: Progress = lambda stage, share, note: None,
+) -> Explored:
+    """Search for contacts that lead to where a sequence ends.
+
+    Args:
+        ik: Workspace.
+        sequence: In the robot's scene. It ends on the same supports, or at the scene's
+            goal; its contacts are the first places that are tried, its postures guide
+            those of like stances.
+        options: How steps are planned.
+        counts: How often a demonstration takes an action.
+        bounds: How far to go.
+        start: What to go on from; None: both feet where the robot starts.
+        report: Called with stage, share and note, for progress.
+    """
+    guide = _Guidance(ik.world, sequence, counts)
+    first = start or Reached(keyframes=(standing(ik, options.keyframe),))
+    queue: list[_Entry] = []
+    order = itertools.count()
+    seen: set[frozenset] = set()
+    often: Counter[frozenset] = Counter()  # like steps that were planned
+    states = tries = 0
+
+    def expand(state: Reached) -> None:
+        for a in guide.actions(ik.kin, state):
+            push(state, a)
+
+    def priority(state: Reached, a: _Action) -> float:
+        after = _after(state.keyframes[-1].stance, a.step.move)
+        again = AGAIN * often[_kind(after)]
+        return state.cost + a.price + EAGER * guide.left(after) + again
+
+    def push(state: Reached, a: _Action) -> None:
+        entry = _Entry(priority(state, a), next(order), state, a)
+        heapq.heappush(queue, entry)
+
+    def ended(found: Reached | None, stop: Stop) -> Explored:
+        state = found or first
+        return Explored(
+            keyframes=state.keyframes,
+            paths=state.paths,
+            sequence=None if found is None else _as_sequence(ik.world, found),
+            states=states,
+            tries=tries,
+            stop=stop,
+        )
+
+    if guide.arrived(first.keyframes[-1]):
+        return ended(first, Stop.FOUND)
+    if bounds.depth > 0:
+        states = 1
+        expand(first)
+    while queue:
+        if tries >= bounds.tries:
+            return ended(None, Stop.TRIES)
+        entry = heapq.heappop(queue)
+        state, action = entry.state, entry.action
+        after = _after(state.keyframes[-1].stance, action.step.move)
+        if _key(after) in seen:  # reached meanwhile, at less cost
+            continue
+        if priority(state, action) > entry.priority:
+            push(state, action)  # it is less promising than it was
+            continue
+        tries += 1
+        often[_kind(after)] += 1
+        report("explore", tries / bounds.tries, str(action.step.move))
+        reached = _take(ik, state, action, options)
+        if reached is None:
+            continue
+        seen |= {_key(after), _key(reached.keyframes[-1].stance)}
+        if guide.arrived(reached.keyframes[-1]):
+            return ended(reached, Stop.FOUND)
+        if len(reached.steps) - len(first.steps) < bounds.depth:
+            states += 1
+            expand(reached)
+    return ended(None, Stop.EXHAUSTED)
+
+
+def _take(
+    ik: IK, state: Reached, action: _Action, options: PlanOptions
+) -> Reached | None:
+    """The state that an action leads to; None where the step cannot be planned."""
+    result = plan_step(
+        ik,
+        state.keyframes[-1],
+        action.step,
+        options.method,
+        options.keyframe,
+        lambda stage: None,
+    )
+    if isinstance(result, str):
+        return None
+    return Reached(
+        keyframes=(*state.keyframes, result[0]),
+        paths=(*state.paths, result[1]),
+        steps=(*state.steps, action.step),
+        cost=state.cost + action.price,
+    )
+
+
+def _after(stance: Sequence[Contact], move: Move) -> tuple[Contact, ...]:
+    """The stance after a move, the new contact where it is wanted."""
+    kept = tuple(c for c in stance if c.surface not in move.breaks)
+    return kept if move.makes is None else (*kept, move.makes)
+
+
+def _key(stance: Sequence[Contact]) -> frozenset:
+    """Equal for stances with the same contacts, to the `CELL`."""
+    return frozenset(
+        (c.surface, c.support, *np.round(c.position[:2] / CELL).astype(int).tolist())
+        for c in stance
+    )
+
+
+def _kind(stance: Sequence[Contact]) -> frozenset:
+    """Equal for stances with the same surfaces on the same supports."""
+    return frozenset((c.surface, c.support) for c in stance)
+
+
+def _as_sequence(world: World, state: Reached) -> ContactSequence:
+    """The stances that a state has come through, one a second.
+
+    A contact is where it was made: a foot that goes on tiptoe later has not moved.
+    """
+    contacts = list(state.keyframes[0].stance)
+    stances = [Stance(contacts=tuple(contacts))]
+    for key, step in zip(state.keyframes[1:], state.steps, strict=True):
+        fresh = {c.surface: c for c in key.stance}
+        contacts = [
+            c
+            if step.move.makes is None or c.surface != step.move.makes.surface
+            else fresh[c.surface]
+            for c in _after(contacts, step.move)
+        ]
+        stances.append(Stance(contacts=tuple(contacts), posture=step.target.posture))
+    return ContactSequence(
+        source="search",
+        subject=None,
+        scene=world.scene,
+        stances=tuple(stances),
+        t=np.arange(len(stances) + 1, dtype=float),
+    )
+
+
+class _Guidance:
+    """What a demonstration says of where to go, and by which actions."""
+
+    def __init__(self, world: World, sequence: ContactSequence, counts: Counts) -> None:
+        self._world, self._sequence, self._counts = world, sequence, counts
+        goal = sequence.stances[-1].contacts
+        limb_of = world.robot.limb_of
+        self._goal = {limb_of(c.surface).name: c.support for c in goal}
+        self._stands = on_feet(world, goal)
+        self._middle = np.mean([c.position[:2] for c in goal], axis=0)
+        begin = {c.support for c in sequence.stances[0].contacts}
+        self._leads_back = set(self._goal.values()) <= begin
+        self._kin = Kinematics(world)
+        self._kin.update(world.home)
+        self._length = {s: self._longest(s) for s in world.surfaces}
+        self._places: dict[tuple[str, str], list[Contact]] = {}
+        for c in (c for s in sequence.stances for c in s.contacts):
+            known = self._places.setdefault((c.surface, c.support), [])
+            if all(_apart(c, k) > CELL for k in known):
+                known.append(c)
+        self._turns = {
+            name: quat_from_matrix(
+                np.eye(3)
+                if name == GROUND
+                else near_edge(support, world.scene.start[:2]).rotation
+            )
+            for name, support in world.supports.items()
+        }
+        self._even = math.log(len(world.surfaces))  # what an action costs unguided
+
+    def arrived(self, key: Keyframe) -> bool:
+        """Is every limb where the demonstration ends, and the pelvis at the goal?
+
+        Where it ends on feet alone, the robot must stand, too.
+        """
+        if self.left(key.stance) > 0:
+            return False
+        if self._stands:
+            share = standing_share(self._world, key.stance, key.q)
+            if not on_feet(self._world, key.stance) or share < STANDING_SHARE:
+                return False
+        if self._world.scene.goal is not None:
+            off = key.q[:2] - self._world.scene.goal[:2]
+            return float(np.linalg.norm(off)) <= GOAL_TOL
+        middle = np.mean([c.position[:2] for c in key.stance], axis=0)
+        near = float(np.linalg.norm(middle - self._middle)) <= BACK_TOL
+        return near or not self._leads_back
+
+    def left(self, stance: Sequence[Contact]) -> float:
+        """What it will cost to get the limbs to the supports that they end on.
+
+        To stand, a leg must be on its foot, and then the arms must let go: until both
+        feet are up they are help, and cost nothing.
+        """
+        on = {self._world.robot.limb_of(c.surface).name: c for c in stance}
+        ends = set(self._goal.values())
+        total = 0.0
+        for limb in self._world.robot.limbs.values():
+            c = on.get(limb.name)
+            goal = self._goal.get(limb.name)
+            if goal is None:  # in the air at the end, or on what the others end on
+                if c is None or c.support in ends:
+                    continue
+                goal = min(ends)
+            elif c is not None and c.support == goal and self._ends_on(c):
+                continue
+            lengths = 1.0
+            if c is not None:
+                away = c.position - self._nearest(goal, c.position)
+                length = max(self._length[s] for s in limb.surfaces)
+                lengths = float(np.linalg.norm(away)) / length
+            total += 1.0 + FAR * lengths
+        if self._stands and total == 0.0:
+            total += sum(not on_feet(self._world, [c]) for c in stance)
+        return total * self._even
+
+    def _ends_on(self, c: Contact) -> bool:
+        """Whether its surface may be the one that a limb ends on."""
+        return not self._stands or on_feet(self._world, [c])
+
+    def actions(self, kin: Kinematics, state: Reached) -> list[_Action]:
+        """All that may be done in a state."""
+        key, world = state.keyframes[-1], self._world
+        region = region_of(key.stance)
+        kin.update(key.q)
+        out = []
+        for limb in world.robot.limbs.values():
+            present = next((c for c in key.stance if c.surface in limb.surfaces), None)
+            others = [c for c in key.stance if c is not present]
+            root = kin.landmark(limb.root)[1].copy()
+            if self._stands and limb.is_arm and present is not None:
+                leaves = Move(limb=limb.name, breaks=(present.surface,), makes=None)
+                out.append(_Action(step=self._step(key, leaves), price=self._even))
+            for surface in limb.surfaces:
+                for support in world.supports:
+                    for c in self._contacts(surface, support, root):
+                        if present is not None and _same(c, present):
+                            continue
+                        if not all(self._within_reach(c, o) for o in others):
+                            continue
+                        move = Move(
+                            limb=limb.name,
+                            breaks=() if present is None else (present.surface,),
+                            makes=c,
+                        )
+                        r = float(np.linalg.norm(c.position - root))
+                        stretch = max(0.0, r / self._length[surface] - 1.0)
+                        price = self._surprise(region, surface) + stretch
+                        out.append(_Action(step=self._step(key, move), price=price))
+        return out
+
+    def _surprise(self, region: Region, surface: str) -> float:
+        """-ln p(surface | region)."""
+        names = self._world.surfaces
+        count = self._counts.get((region, surface), 0.0)
+        total = sum(self._counts.get((region, s), 0.0) for s in names)
+        return -math.log((count + UNSEEN) / (total + UNSEEN * len(names)))
+
+    def _contacts(self, surface: str, support: str, root: np.ndarray) -> list[Contact]:
+        """Where a surface may be put: as demonstrated, or below what it supports."""
+        below = Contact(
+            surface=surface,
+            support=support,
+            position=self._nearest(support, root),
+            quaternion=self._turns[support],
+        )
+        known = self._places.get((surface, support), [])
+        return [*known, *([below] if all(not _same(below, k) for k in known) else [])]
+
+    def _nearest(self, support: str, p: np.ndarray) -> np.ndarray:
+        """The nearest place (3,) on a support, `INSET` from its border."""
+        s = self._world.supports[support]
+        half = np.maximum(s.polygon.max(axis=0) - INSET, 0.0)
+        local = s.rotation.T @ (p - s.position)
+        return s.position + s.rotation @ np.array([*np.clip(local[:2], -half, half), 0])
+
+    def _step(self, key: Keyframe, move: Move) -> Step:
+        """With the demonstrated stance most like the one it leads to."""
+        after = {(c.surface, c.support) for c in _after(key.stance, move)}
+
+        def unlike(i: int) -> int:
+            there = self._sequence.stances[i].contacts
+            return len(after ^ {(c.surface, c.support) for c in there})
+
+        i = min(range(len(self._sequence.stances)), key=unlike)
+        contacts = _after(key.stance, move)
+        return Step(
+            stance=i,
+            target=self._sequence.stances[i],
+            move=move,
+            rises=on_feet(self._world, contacts) and self.left(contacts) == 0,
+        )
+
+    def _longest(self, surface: str) -> float:
+        """From shoulder or hip to a surface, the limb stretched [m]."""
+        limb = self._world.robot.limb_of(surface)
+        a, b, c = (self._kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
+        p = self._kin.contact_point(surface, np.array([0.0, 0.0, 1.0]))
+        upper, lower = np.linalg.norm(b - a), np.linalg.norm(c - b)
+        by_middle, by_end = np.linalg.norm(p - b), lower + np.linalg.norm(p - c)
+        nearer = np.linalg.norm(p - b) < np.linalg.norm(p - c)
+        return float(upper + (by_middle if nearer else by_end))
+
+    def _within_reach(self, a: Contact, b: Contact) -> bool:
+        """Whether some posture may close both contacts."""
+        limb_of = self._world.robot.limb_of
+        roots = [self._kin.landmark(limb_of(x.surface).root)[1] for x in (a, b)]
+        trunk = TRUNK_GIVE * float(np.linalg.norm(roots[0] - roots[1]))
+        longest = trunk + self._length[a.surface] + self._length[b.surface]
+        return _apart(a, b) <= longest
+
+
+def _apart(a: Contact, b: Contact) -> float:
+    return float(np.linalg.norm(a.position - b.position))
+
+
+def _same(a: Contact, b: Contact) -> bool:
+    at = (a.surface, a.support) == (b.surface, b.support)
+    return at and _apart(a, b) < SAME_PLACE

@@ -1,0 +1,552 @@
+"""Paths -> one timed trajectory, 1 kHz, velocity the exact derivative.
+
+Each phase is a cubic spline through its postures, at rest at both ends, parametrised by
+the largest joint angle travelled; time runs along it under a velocity profile that
+accelerates, cruises at the speed limit and brakes. The base's rotation is the
+normalised spline of its quaternion, so that the angular velocity is its derivative on
+the manifold.
+
+Feed-forward torques balance gravity with the contact forces of least norm at every
+posture, those of leaving contacts ever dearer, and are interpolated along the spline.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
+
+from clamber.contact.contact import Contact
+from clamber.model.kinematics import Kinematics
+from clamber.model.se3 import quat_conjugate, quat_multiply
+from clamber.model.world import World
+from clamber.planning.timing import GRID, demand_at, least_torques, retime
+from clamber.step.path import Phase
+from clamber.step.posture import bearing_frames, torque_limits
+from clamber.step.statics import GRAVITY, com_margins, contact_forces, support_polygon
+
+RATE = 1000.0  # [Hz]
+REST = 0.10  # [s] at rest between two phases
+TOUCH_REST, MIN_REST = 0.08, 0.02  # [s] ... of a fast motion: after a touch, elsewhere
+HOLD_START = 0.3  # [s]
+HOLD_END = 2.0  # [s] the last posture is held
+ACCELERATION = 4.0  # [1/s] the cruise speed is reached after a quarter of a second
+MIN_PHASE = 0.2  # [s]
+BASE_LENGTH = 0.3  # [m] of base translation count as one radian
+INERTIA_SHARE = 0.6  # of the balance margin that inertia may use up
+BALANCE_SAMPLES = 24  # of the centre of mass along a phase
+BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
+SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
+LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
+TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
+SAMPLES = 24  # per gap between two postures, to find the largest speed
+
+
+Sampling = Callable[[int], Sequence[np.ndarray]]
+
+
+class Samples:
+    """(T, n) rows that are sampled when they are asked for, block after block.
+
+    Indexed as an array is, by rows and then by columns; `np.asarray` gives all of it.
+    The last block is kept, so that neighbouring rows cost no more than those of an
+    array: a reference of 1000 samples a second takes no memory.
+    """
+
+    def __init__(self, sample: Sampling, which: int, ends: np.ndarray, n: int) -> None:
+        """Rows of one of the arrays (m, n) that `sample` gives for each block.
+
+        Args:
+            sample: By the number of the block; called again where it was left.
+            which: Of its arrays.
+            ends: (B,) the row at which each block ends.
+            n: Columns.
+        """
+        self.shape = int(ends[-1]), n
+        self._sample, self._which, self._ends = sample, which, ends
+        # From which row on, and the rows: one value, for who reads in several threads.
+        self._held = 0, np.zeros((0, n))
+
+    def __len__(self) -> int:
+        """T."""
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> np.ndarray:
+        """Rows, and columns of them where there are two indices."""
+        rows, *columns = key if isinstance(key, tuple) else (key,)
+        if isinstance(rows, (int, np.integer)):
+            k = int(rows) + (len(self) if rows < 0 else 0)
+            start, block = self._held
+            if not start <= k < start + len(block):
+                if not 0 <= k < len(self):
+                    raise IndexError(f"row {rows} of {len(self)}")
+                start, block = self._look(np.searchsorted(self._ends, k, side="right"))
+            out = block[k - start]
+            return out[columns[0]] if columns else out
+        if isinstance(rows, slice):
+            some = self._gather(np.arange(*rows.indices(len(self))))
+            return some[(slice(None), *columns)]
+        index = np.asarray(rows)
+        index = np.flatnonzero(index) if index.dtype == bool else index
+        if index.size and not -len(self) <= index.min() <= index.max() < len(self):
+            raise IndexError(f"rows {index.min()} to {index.max()} of {len(self)}")
+        some = self._gather(index.ravel() % len(self))
+        return some[(np.arange(index.size).reshape(index.shape), *columns)]
+
+    def _gather(self, rows: np.ndarray) -> np.ndarray:
+        out = np.empty((len(rows), self.shape[1]))
+        number = np.searchsorted(self._ends, rows, side="right")
+        for i in np.unique(number):
+            mine = number == i
+            start, block = self._look(i)
+            out[mine] = block[rows[mine] - start]
+        return out
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Row after row."""
+        for block in self.blocks():
+            yield from block
+
+    def __array__(
+        self, dtype: np.dtype | None = None, copy: bool | None = None
+    ) -> np.ndarray:
+        """All rows."""
+        return np.concatenate(list(self.blocks())).astype(dtype, copy=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled as the array of all rows."""
+        return np.asarray, (np.asarray(self),)
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """(m, n) the rows of one block after the other."""
+        for i in range(len(self._ends)):
+            yield self._look(i)[1]
+
+    def _look(self, i: int | np.integer) -> tuple[int, np.ndarray]:
+        block = self._sample(int(i))[self._which]
+        self._held = int(self._ends[i]) - len(block), block
+        return self._held
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Trajectory:
+    """A timed reference.
+
+    Attributes:
+        time: (T,) [s]; q: (T, nq); v: (T, nv) the derivative of q on the manifold.
+        tau: (T, na) feed-forward joint torques [N m]. As planned, these three are
+            sampled when they are asked for.
+        contact: (T, nS) bool, closed contacts by `surfaces`.
+        joints: (na,) names.
+        keyframes: (K,) time at which each keyframe is reached [s].
+    """
+
+    time: np.ndarray
+    q: np.ndarray | Samples
+    v: np.ndarray | Samples
+    tau: np.ndarray | Samples
+    contact: np.ndarray
+    surfaces: tuple[str, ...]
+    joints: tuple[str, ...]
+    keyframes: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check shapes, make arrays read-only."""
+        n = len(self.time)
+        for name in ("q", "v", "tau", "contact"):
+            x = getattr(self, name)
+            if len(x) != n:
+                raise ValueError(f"{name} has {len(x)} rows, expected {n}")
+            if isinstance(x, np.ndarray):
+                x.setflags(write=False)
+
+    def at(self, t: float) -> int:
+        """Index of the sample at time `t` [s], clipped to the ends."""
+        return int(np.clip(round(t * RATE), 0, len(self.time) - 1))
+
+    def velocity_error(self, world: World) -> float:
+        """Largest difference of v and the central difference of q [rad/s, m/s]."""
+        kin = Kinematics(world)
+        worst = 0.0
+        for k in range(1, len(self.time) - 1, 7):
+            v = kin.difference(self.q[k - 1], self.q[k + 1]) * (RATE / 2)
+            worst = max(worst, float(np.abs(v - self.v[k]).max()))
+        return worst
+
+
+def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
+    """(n, na) torques that hold each posture of a phase, load handed over along it."""
+    share = _arclength(kin, phase.q)
+    share = share / share[-1] if share[-1] > 0 else share
+    return np.array(
+        [
+            holding_torque(kin, q, *handed_over(phase, float(s)))
+            for q, s in zip(phase.q, share, strict=True)
+        ]
+    )
+
+
+def handed_over(phase: Phase, share: float) -> tuple[tuple[Contact, ...], np.ndarray]:
+    """Contacts (n of them) that may bear at a share of a phase, and prices of force.
+
+    The price of a contact that only bears at the start is 1 / (1 - share), of one that
+    only bears at the end 1 / share, of others 1: load passes from the ones to the
+    others, but only as far as the robot's balance allows. While the centre of mass is
+    not yet over the contacts that stay, those that leave go on bearing.
+    """
+    before = {(c.surface, c.edge): c for c in phase.load_before}
+    after = {(c.surface, c.edge): c for c in phase.load_after}
+    contacts, price = [], []
+    for key, c in {**before, **after}.items():
+        left = 1.0 - share * (key not in after) - (1.0 - share) * (key not in before)
+        if left > LEAST_SHARE:
+            contacts.append(c)
+            price.append(1.0 / left)
+    return tuple(contacts), np.array(price)
+
+
+def holding_torque(
+    kin: Kinematics,
+    q: np.ndarray,
+    contacts: Sequence[Contact],
+    price: np.ndarray | None = None,
+) -> np.ndarray:
+    """(na,) joint torques that balance gravity with the least contact forces.
+
+    Where these ask more of a joint than its `holding_limits`, those that do not:
+    a weak wrist leaves the load to the feet.
+
+    Args:
+        kin: Workspace.
+        q: (nq,).
+        contacts: n that may bear.
+        price: (n,) of the force of each; None: 1 each.
+    """
+    w = kin.world
+    kin.update(q)
+    names, points, normals, mu = bearing_frames(kin, contacts)
+    com = kin.com.copy()
+    limits = torque_limits(kin, names, points)
+    prices = None if price is None else point_prices(kin, contacts, price)
+    tau = np.zeros(len(w.dadr))
+    for torque in (None, limits):
+        found = contact_forces(
+            points, normals, mu, com, w.mass, torque=torque, price=prices
+        )
+        tau = limits.torques(found.forces)
+        if np.all(np.abs(tau) <= limits.limits):
+            break
+    return np.clip(tau, -w.tau_max, w.tau_max)
+
+
+def point_prices(
+    kin: Kinematics, contacts: Sequence[Contact], price: np.ndarray
+) -> np.ndarray:
+    """(nc,) the price of each bearing point, from those of the contacts (n,)."""
+    up = [kin.world.supports[c.support].normal for c in contacts]
+    count = [
+        len(kin.bearing_points(c.surface, n, c.edge))
+        for c, n in zip(contacts, up, strict=True)
+    ]
+    return np.repeat(price, count)
+
+
+def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
+    """(n,) path parameter: the largest joint angle travelled, base included, scaled."""
+    steps = [0.0]
+    for a, b in itertools.pairwise(nodes):
+        d = kin.difference(a, b)
+        d[:3] /= BASE_LENGTH
+        steps.append(max(float(np.abs(d).max()), 1e-6))
+    return np.cumsum(steps)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Spline:
+    """One phase as a function of its path parameter."""
+
+    curve: CubicSpline
+    tau: BSpline
+    length: float
+    cruise: float  # ds/dt at which the fastest joint has the speed limit
+
+    def sample(self, s: np.ndarray, sdot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        raw, slope = self.curve(s), self.curve(s, 1)
+        q, v = _on_manifold(raw, slope)
+        return q, v * sdot[:, None]
+
+
+def _on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Configurations (n, nq) and tangent vectors (n, nv) of raw coordinates."""
+    q = raw.copy()
+    norm = np.linalg.norm(raw[:, 3:7], axis=1, keepdims=True)
+    unit = raw[:, 3:7] / norm
+    q[:, 3:7] = unit
+    rate = (
+        slope[:, 3:7] - unit * np.sum(unit * slope[:, 3:7], axis=1, keepdims=True)
+    ) / norm
+    omega = 2.0 * quat_multiply(quat_conjugate(unit), rate)[:, 1:]
+    return q, np.concatenate([slope[:, :3], omega, slope[:, 7:]], axis=1)
+
+
+def _spline(kin: Kinematics, phase: Phase, speed: float, v_max: np.ndarray) -> _Spline:
+    nodes = phase.q.copy()
+    for k in range(1, len(nodes)):
+        if nodes[k, 3:7] @ nodes[k - 1, 3:7] < 0:
+            nodes[k, 3:7] *= -1
+    s = _arclength(kin, nodes)
+    curve = CubicSpline(s, nodes, bc_type="natural" if len(nodes) > 2 else "not-a-knot")
+    tau = make_interp_spline(s, phase_torques(kin, phase), k=1)
+    fine = np.linspace(0.0, s[-1], SAMPLES * len(nodes))
+    _, slope = _on_manifold(curve(fine), curve(fine, 1))
+    slope = np.abs(slope)
+    slope[:, :3] /= BASE_LENGTH
+    limit = np.minimum(speed, v_max)
+    cruise = float((limit / np.maximum(slope.max(axis=0), 1e-9)).min())
+    if not np.isfinite(cruise):
+        return _Spline(curve, tau, float(s[-1]), cruise)
+    cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
+    return _Spline(curve, tau, float(s[-1]), cruise)
+
+
+def zero_moment_point(
+    com: np.ndarray, acceleration: np.ndarray, z: float
+) -> np.ndarray:
+    """(n, 2) where the ground force acts if all mass were at the centre of mass.
+
+    p = c - (c_z - z) / (g + a_z) a, over the horizontal: what the inertia of a fast
+    motion adds to the projection of the centre of mass [Vukobratovic04].
+
+    Args:
+        com: (n, 3) [m].
+        acceleration: (n, 3) of the centre of mass [m/s^2].
+        z: Height of the contacts [m].
+    """
+    lever = (com[:, 2] - z) / (GRAVITY + acceleration[:, 2])
+    return com[:, :2] - lever[:, None] * acceleration[:, :2]
+
+
+def _balanced_cruise(
+    kin: Kinematics, phase: Phase, curve: CubicSpline, length: float, cruise: float
+) -> float:
+    """The cruise speed, reduced until inertia leaves the robot its balance.
+
+    The zero-moment point may use up `INERTIA_SHARE` of the distance that the centre of
+    mass has to the border of the support polygon.
+    """
+    fine = np.linspace(0.0, length, BALANCE_SAMPLES)
+    com = np.empty((len(fine), 3))
+    for i, q in enumerate(_on_manifold(curve(fine), curve(fine, 1))[0]):
+        kin.update(q)
+        com[i] = kin.com
+    path = CubicSpline(fine, com)
+    points = bearing_frames(kin, phase.contacts)[1]
+    polygon = support_polygon(points[:, :2])
+    low = float(points[:, 2].min())
+    room = np.maximum(com_margins(com[:, :2], polygon), 0.0)
+    for _ in range(MAX_SLOWINGS):
+        s, rate = _profile(length, cruise)[::BALANCE_STRIDE].T
+        change = np.gradient(rate, BALANCE_STRIDE / RATE)
+        acceleration = path(s, 2) * rate[:, None] ** 2 + path(s, 1) * change[:, None]
+        p = zero_moment_point(path(s), acceleration, low)
+        margin = com_margins(p, polygon)
+        if np.all(margin >= (1.0 - INERTIA_SHARE) * np.interp(s, fine, room)):
+            break
+        cruise *= SLOWING
+    return cruise
+
+
+def _profile(length: float, cruise: float) -> np.ndarray:
+    """(n, 2) s and ds/dt at 1 kHz: smooth rise to the cruise speed, smooth fall.
+
+    The rise is a raised cosine, so that acceleration has no jumps.
+    """
+    ramp = 1.5 / ACCELERATION
+    if length < cruise * ramp:
+        cruise = length / ramp
+    total = max(length / cruise + ramp, MIN_PHASE, 2 * ramp)
+    n = int(np.ceil(total * RATE))
+    total = n / RATE  # a whole number of samples, else ds/dt is not the derivative
+    t = np.arange(1, n + 1) / RATE
+
+    def rise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = np.clip(x, 0.0, ramp)
+        return (
+            0.5 * (x - ramp / np.pi * np.sin(np.pi * x / ramp)),
+            0.5 * (1 - np.cos(np.pi * x / ramp)),
+        )
+
+    up, up_rate = rise(t)
+    down, down_rate = rise(total - t)
+    plateau = max(total - 2 * ramp, 0.0)
+    s = np.where(
+        t <= ramp,
+        up,
+        np.where(t <= ramp + plateau, 0.5 * ramp + (t - ramp), ramp + plateau - down),
+    )
+    rate = np.where(t <= ramp, up_rate, np.where(t <= ramp + plateau, 1.0, down_rate))
+    scale = length / (ramp + plateau)
+    return np.stack([s * scale, rate * scale], axis=1)
+
+
+def _made(phases: Sequence[Phase], i: int) -> Contact | None:
+    """The contact that is made at the end of a phase, if any."""
+    if i + 1 == len(phases):
+        return None
+    before = {(c.surface, c.support) for c in phases[i].contacts}
+    after = phases[i + 1].contacts
+    return next((c for c in after if (c.surface, c.support) not in before), None)
+
+
+def _fastest(
+    kin: Kinematics, phase: Phase, spline: _Spline, made: Contact | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """s, ds/dt (n,) and torques (n, na) of the fastest motion along a phase."""
+    grid = np.linspace(0.0, spline.length, GRID)
+    q, slope = _on_manifold(spline.curve(grid), spline.curve(grid, 1))
+    s, rate = retime(
+        kin, grid, q, slope, _bend(spline.curve, grid), phase.contacts, made
+    )
+    change = np.gradient(rate, 1.0 / RATE) if len(rate) > 1 else np.zeros(1)
+    look = np.unique([*range(0, len(s), TORQUE_STRIDE), len(s) - 1])
+    raw = spline.curve(s[look])
+    q, slope = _on_manifold(raw, spline.curve(s[look], 1))
+    bend = _bend(spline.curve, s[look])
+    tau = []
+    for i, k in enumerate(look):
+        contacts, price = handed_over(phase, float(s[k]) / spline.length)
+        demand = demand_at(kin, q[i], slope[i], bend[i], contacts)
+        prices = point_prices(kin, contacts, price)
+        squared = float(rate[k] ** 2)
+        tau.append(least_torques(kin, demand, float(change[k]), squared, prices))
+    return s, rate, make_interp_spline(look, np.array(tau), k=1)(np.arange(len(s)))
+
+
+def _bend(curve: CubicSpline, s: np.ndarray) -> np.ndarray:
+    """(n, nv) derivative of the tangent vector along the path."""
+    raw, slope, bend = curve(s), curve(s, 1), curve(s, 2)
+    norm = np.sum(raw[:, 3:7] ** 2, axis=1, keepdims=True)
+    inverse = quat_conjugate(raw[:, 3:7])
+    omega = 2.0 * quat_multiply(inverse, slope[:, 3:7])[:, 1:] / norm
+    stretch = 2.0 * np.sum(raw[:, 3:7] * slope[:, 3:7], axis=1, keepdims=True) / norm
+    turn = 2.0 * quat_multiply(inverse, bend[:, 3:7])[:, 1:] / norm - stretch * omega
+    return np.concatenate([bend[:, :3], turn, bend[:, 7:]], axis=1)
+
+
+def build_trajectory(
+    world: World,
+    phases: Sequence[Phase],
+    *,
+    speed: float | Literal["max"],
+    keyframe_after: Sequence[int] = (0,),
+) -> Trajectory:
+    """Time the phases one after the other.
+
+    Args:
+        world: Robot and scene.
+        phases: In order; each begins with the last posture of the one before.
+        speed: Largest joint speed [rad/s]; `max`: as fast as joints and contacts bear.
+        keyframe_after: How many phases end before each keyframe is reached.
+
+    Raises:
+        ValueError: Two phases do not join.
+    """
+    kin = Kinematics(world)
+    surfaces = tuple(world.surfaces)
+    runs = [_run(kin, phases, i, speed) for i in range(len(phases))]
+    lengths = [x.lead + x.n + x.rest for x in runs]
+    stops, n = np.cumsum(lengths), sum(lengths)
+    closed = [{c.surface for c in phase.contacts} for phase in phases]
+    flags = np.array([[s in c for s in surfaces] for c in closed])
+    ends = [0, *(stops - 1).tolist()]
+
+    @functools.lru_cache(maxsize=1)
+    def moving(i: int) -> tuple[np.ndarray, np.ndarray]:
+        return runs[i].motion()
+
+    model = world.model
+    return Trajectory(
+        time=np.arange(n) / RATE,
+        q=Samples(moving, 0, stops, model.nq),
+        v=Samples(moving, 1, stops, model.nv),
+        tau=Samples(lambda i: (runs[i].torques(),), 0, stops, len(world.joints)),
+        contact=np.repeat(flags, lengths, axis=0),
+        surfaces=surfaces,
+        joints=world.joints,
+        keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
+    )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Run:
+    """One phase in time, with samples of rest before and after it.
+
+    How far along the path it is and how fast, (2, n), and the torques (n, na) are kept
+    where they are not those of the profile and of the spline.
+    """
+
+    spline: _Spline
+    n: int
+    timing: np.ndarray | None
+    tau: np.ndarray | None
+    lead: int
+    rest: int
+
+    def motion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Configurations and velocities, rest included."""
+        s, rate = self._timing()
+        q, v = self.spline.sample(s, rate)
+        if self.lead:
+            first, _ = self.spline.sample(np.zeros(1), np.zeros(1))
+            q = np.concatenate([np.repeat(first, self.lead, axis=0), q])
+        still = np.zeros((self.lead, v.shape[1])), np.zeros((self.rest, v.shape[1]))
+        q = np.concatenate([q, np.repeat(q[-1:], self.rest, axis=0)])
+        v = np.concatenate([still[0], v, still[1]])
+        q.setflags(write=False)
+        v.setflags(write=False)
+        return q, v
+
+    def torques(self) -> np.ndarray:
+        """Feed-forward torques, rest included."""
+        tau = self.spline.tau(self._timing()[0]) if self.tau is None else self.tau
+        first = np.repeat(self.spline.tau(np.zeros(1)), self.lead, axis=0)
+        tau = np.concatenate([first, tau, np.repeat(tau[-1:], self.rest, axis=0)])
+        tau.setflags(write=False)
+        return tau
+
+    def _timing(self) -> np.ndarray:
+        if self.timing is not None:
+            return self.timing
+        return _profile(self.spline.length, self.spline.cruise).T
+
+
+def _run(
+    kin: Kinematics,
+    phases: Sequence[Phase],
+    i: int,
+    speed: float | Literal["max"],
+) -> _Run:
+    phase = phases[i]
+    if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
+        raise ValueError(
+            f"phase {i} ({phase.kind}) does not begin where the last one ended"
+        )
+    cruise = np.inf if speed == "max" else speed
+    spline = _spline(kin, phase, cruise, kin.world.v_max)
+    timing = torque = None
+    if speed == "max":
+        made = _made(phases, i)
+        s, rate, torque = _fastest(kin, phase, spline, made)
+        timing, n = np.stack([s, rate]), len(s)
+        rest = TOUCH_REST if made else MIN_REST
+    else:
+        n, rest = len(_profile(spline.length, spline.cruise)), REST
+    if i == len(phases) - 1:
+        rest = HOLD_END
+    lead = 0 if i else round(HOLD_START * RATE)
+    return _Run(spline, n, timing, torque, lead, round(rest * RATE))

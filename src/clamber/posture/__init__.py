@@ -1,1 +1,0 @@
-"""Stance and demonstrated posture -> stable posture."""

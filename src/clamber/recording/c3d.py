@@ -1,0 +1,392 @@
+"""C3D, the exchange format of motion capture: 512-byte blocks, parameters, samples.
+
+Read and written here rather than through `ezc3d`: that library holds each marker of
+each sample as an object and trusts the counts in the file (see docs/recordings.md).
+The tests compare both on the same files.
+
+A marker's sample is x, y, z and a fourth word that is negative where the marker was not
+seen. Numbers are floats or scaled integers, of Intel, MIPS or DEC byte order.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from clamber.errors import InputError
+from clamber.recording.demonstration import Demonstration
+from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
+
+KEY = 0x50  # second byte of every C3D file
+_BLOCK = 512
+_INTEL, _DEC, _MIPS = 84, 85, 86
+# Results of models that share the list of points with the markers.
+_RESULTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
+_Parameters = dict[tuple[str, str], np.ndarray | list[str]]
+
+
+def read_c3d(path: Path) -> Points:
+    """Markers of a C3D file; what was not seen is NaN.
+
+    Raises:
+        InputError: It is no such file, with the byte and what was expected there.
+        OSError: It cannot be opened.
+    """
+    content = np.fromfile(path, dtype=np.uint8)
+    if len(content) < 2 * _BLOCK or content[1] != KEY:
+        raise InputError(
+            f"a C3D file: at least {2 * _BLOCK} bytes, the second one {KEY:#x}",
+            source=path,
+            field="byte 1",
+        )
+    start = (int(content[0]) - 1) * _BLOCK
+    if not _BLOCK <= start <= len(content) - 4:
+        raise InputError(
+            "the number of the block where parameters begin", source=path,
+            field="byte 0", value=int(content[0]),
+        )  # fmt: skip
+    processor = int(content[start + 3])
+    if processor not in (_INTEL, _DEC, _MIPS):
+        raise InputError(
+            f"processor {_INTEL}, {_DEC} or {_MIPS}",
+            source=path,
+            field=f"byte {start + 3}",
+            value=processor,
+        )
+    parameters = _read_parameters(content, start, processor, path)
+    header = _Header.read(content, parameters, processor, path)
+    position = _read_samples(content, header, processor, path)
+    names = _labels(parameters, header.points, path)
+    results = {n for kind in _RESULTS for n in _words(parameters, kind)}
+    keep = [i for i, n in enumerate(names) if n not in results]
+    if len(keep) < len(names):
+        position = position[:, keep]
+        names = [names[i] for i in keep]
+    units = _words(parameters, "UNITS")
+    return Points(
+        names=unique_names(names),
+        position=position,
+        rate=header.rate,
+        unit=unit_of(units[0], path, "POINT:UNITS") if units and units[0] else None,
+        up=_up(parameters),
+    )
+
+
+def _numbers(raw: np.ndarray, kind: str, processor: int) -> np.ndarray:
+    """Bytes as `i2` or `f4` numbers of the processor that wrote them."""
+    raw = np.ascontiguousarray(raw)
+    if processor == _MIPS:
+        return raw.view(f">{kind}").astype(kind)
+    if processor == _DEC and kind == "f4":
+        # Words are swapped and the exponent is two larger than that of IEEE.
+        swapped = raw.view("<u2").reshape(-1, 2)[:, ::-1]
+        with np.errstate(invalid="ignore"):  # what is no number stays none
+            return np.ascontiguousarray(swapped).view("<f4").ravel() * np.float32(0.25)
+    return raw.view(f"<{kind}").astype(kind, copy=False)
+
+
+def _read_parameters(
+    content: np.ndarray, start: int, processor: int, path: Path
+) -> _Parameters:
+    """All parameters by group and name, upper case."""
+    groups: dict[int, str] = {}
+    found: list[tuple[int, str, np.ndarray | list[str]]] = []
+    at, end = start + 4, min(len(content), start + 255 * _BLOCK)
+    order = ">" if processor == _MIPS else "<"
+    while True:
+        if at + 2 > end:
+            raise InputError(
+                "the end of the parameters", source=path, field=f"byte {at}"
+            )
+        length, group = (int(x) for x in content[at : at + 2].view(np.int8))
+        if length == 0 or group == 0:
+            break
+        name_end = at + 2 + abs(length)
+        if name_end + 2 > end:
+            raise InputError(
+                f"a name of {abs(length)} bytes", source=path, field=f"byte {at}"
+            )
+        name = content[at + 2 : name_end].tobytes().decode("latin-1").strip().upper()
+        (step,) = struct.unpack(f"{order}h", content[name_end : name_end + 2].tobytes())
+        if group < 0:
+            groups[-group] = name
+        else:
+            value = _read_value(content, name_end + 2, processor, path)
+            found.append((group, name, value))
+        if step == 0:
+            break
+        if step < 3:
+            raise InputError(
+                "a step forward to the next parameter", source=path,
+                field=f"byte {name_end}", value=step,
+            )  # fmt: skip
+        at = name_end + step
+    return {(groups.get(g, ""), n): v for g, n, v in found}
+
+
+def _read_value(
+    content: np.ndarray, at: int, processor: int, path: Path
+) -> np.ndarray | list[str]:
+    """A parameter's numbers, flat, or its strings."""
+    head = content[at : at + 2]
+    kind, rank = (int(x) for x in head.view(np.int8)) if len(head) == 2 else (0, -1)
+    sizes = [int(d) for d in content[at + 2 : at + 2 + max(rank, 0)]]
+    width = {-1: 1, 1: 1, 2: 2, 4: 4}.get(kind, 0)
+    count = int(np.prod(sizes, dtype=object)) if sizes else 1
+    data = at + 2 + max(rank, 0)
+    if width == 0 or not 0 <= rank <= 7 or data + count * width > len(content):
+        raise InputError(
+            "type -1, 1, 2 or 4, at most 7 dimensions, and as many values",
+            source=path,
+            field=f"byte {at}",
+            value=[kind, rank, *sizes],
+        )
+    raw = content[data : data + count * width]
+    if kind == -1:
+        text, wide = raw.tobytes().decode("latin-1"), sizes[0] if sizes else 1
+        starts = range(0, count, wide) if wide else ()
+        return [text[k : k + wide].strip(" \0") for k in starts[:255]]
+    if kind == 1:
+        return raw.copy()
+    return _numbers(raw, "i2" if kind == 2 else "f4", processor)
+
+
+def _words(parameters: _Parameters, name: str) -> list[str]:
+    """Strings of a parameter of POINT; none where it has none."""
+    value = parameters.get(("POINT", name), [])
+    return value if isinstance(value, list) else []
+
+
+def _number(parameters: _Parameters, group: str, name: str) -> float | None:
+    """First number of a parameter; None where it has none."""
+    value = parameters.get((group, name))
+    if isinstance(value, list) or value is None or not len(value):
+        return None
+    return float(value[0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Header:
+    """Where the samples lie and how."""
+
+    points: int
+    analog: int  # numbers of a sample that belong to other devices
+    frames: int
+    start: int  # [byte]
+    scale: float  # negative: floats
+    rate: float
+
+    @classmethod
+    def read(
+        cls, content: np.ndarray, parameters: _Parameters, processor: int, path: Path
+    ) -> _Header:
+        """Of the first block, and of the parameters where that has no room for it."""
+        words = _numbers(content[:_BLOCK], "i2", processor).view(np.uint16)
+        scale, rate = (
+            float(_numbers(content[b : b + 4], "f4", processor)[0]) for b in (12, 20)
+        )
+        points, analog, first, last = (int(w) for w in words[1:5])
+        frames = last - first + 1
+        if (long := _long_frames(parameters)) is not None:
+            frames = long
+        said = _number(parameters, "POINT", "SCALE")
+        scale = scale if said is None or np.isnan(said) else said
+        said = _number(parameters, "POINT", "RATE")
+        rate = rate if said is None else said
+        start = (int(words[8]) - 1) * _BLOCK
+        if not 0 < points <= MAX_POINTS:
+            raise InputError(
+                f"between 1 and {MAX_POINTS} points", source=path, field="byte 2",
+                value=points,
+            )  # fmt: skip
+        if frames < 1 or not _BLOCK <= start <= len(content):
+            raise InputError(
+                "samples, after the parameters",
+                source=path,
+                field="byte 6 (frames), byte 16 (block)",
+                value=[frames, start // _BLOCK + 1],
+            )
+        return cls(
+            points=points, analog=analog, frames=frames, start=start, scale=scale,
+            rate=rate,
+        )  # fmt: skip
+
+
+def _long_frames(parameters: _Parameters) -> int | None:
+    """Count of samples where 16 bits may not hold it; None where nothing says so."""
+    ends = []
+    for name in ("ACTUAL_START_FIELD", "ACTUAL_END_FIELD"):
+        value = parameters.get(("TRIAL", name))
+        if isinstance(value, np.ndarray) and value.dtype == np.int16 and len(value) > 1:
+            low, high = (int(w) for w in value[:2].view(np.uint16))
+            ends.append(low + (high << 16))
+    if len(ends) == 2 and ends[1] >= ends[0]:
+        return ends[1] - ends[0] + 1
+    for name in ("LONG_FRAMES", "FRAMES"):
+        value = parameters.get(("POINT", name))
+        if isinstance(value, np.ndarray) and len(value):
+            count = (
+                value[:1].view(np.uint16)[0] if value.dtype == np.int16 else value[0]
+            )
+            if np.isfinite(count) and count >= 1:
+                return int(count)
+    return None
+
+
+def _read_samples(
+    content: np.ndarray, header: _Header, processor: int, path: Path
+) -> np.ndarray:
+    """(T, F, 3) float32, NaN where the fourth word says so or all three are zero."""
+    kind = "f4" if header.scale < 0 else "i2"
+    width = int(kind[1])
+    row = (4 * header.points + header.analog) * width
+    end = header.start + header.frames * row
+    if end > len(content):
+        present = (len(content) - header.start) // row
+        raise InputError(
+            f"{header.frames} samples of {row} bytes each from byte {header.start} on; "
+            f"the file ends after {present}",
+            source=path,
+            field=f"byte {len(content)}",
+        )
+    rows = content[header.start : end].reshape(header.frames, row)
+    out = np.empty((header.frames, header.points, 3), dtype=np.float32)
+    step = max(1, (1 << 22) // row)
+    for k in range(0, header.frames, step):
+        block = rows[k : k + step, : 4 * header.points * width]
+        x = _numbers(block.ravel(), kind, processor).reshape(len(block), -1, 4)
+        with np.errstate(invalid="ignore", over="ignore"):
+            place = x[..., :3].astype(np.float32)
+            if kind == "i2":
+                place *= np.float32(abs(header.scale))
+            unseen = (x[..., 3] < 0) | ~np.any(place != 0, axis=2)
+        place[unseen] = np.nan
+        out[k : k + step] = place
+    return out
+
+
+def _labels(parameters: _Parameters, count: int, path: Path) -> list[str]:
+    """Names of the points: LABELS, LABELS2 ... each hold at most 255."""
+    labels = _words(parameters, "LABELS")
+    k = 2
+    while more := _words(parameters, f"LABELS{k}"):
+        labels, k = labels + more, k + 1
+    if len(labels) < count:
+        raise InputError(
+            f"{count} labels in POINT:LABELS", source=path, field="POINT:LABELS",
+            value=len(labels),
+        )  # fmt: skip
+    return labels[:count]
+
+
+def _up(parameters: _Parameters) -> str | None:
+    """The axis that the screen shows upward.
+
+    Its sign is not heeded: programs write -Z for a laboratory whose z is up.
+    """
+    words = _words(parameters, "Y_SCREEN")
+    axis = words[0].strip().lower().lstrip("+-") if words else ""
+    return axis if axis in ("x", "y", "z") else None
+
+
+def write_c3d(demo: Demonstration, path: str | Path) -> None:
+    """Write a demonstration's points as C3D: millimetres, floats, z up.
+
+    Opens in Mokka, OpenSim and Visual3D. The boxes are not part of the file:
+    `recording.yaml` names them.
+
+    Args:
+        demo: What to write; long gaps stay gaps, short ones are as filled.
+        path: The file.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    n, f = len(demo.t), len(demo.names)
+    samples = np.zeros((n, f, 4), dtype="<f4")
+    samples[..., :3] = np.where(demo.valid[..., None], 1000.0 * demo.position, 0.0)
+    samples[..., 3] = np.where(demo.valid, 0.0, -1.0)
+
+    def build(start: int) -> bytes:
+        return _parameter_section(demo, start)
+
+    blocks = len(build(0)) // _BLOCK
+    start = 2 + blocks
+    last = min(n, 65535)
+    header = struct.pack(
+        "<BBHHHHHfHHf", 2, KEY, f, 0, 1, last, 0, -1.0, start, 1, demo.rate
+    )
+    body = samples.tobytes()
+    padding = b"\0" * (-len(body) % _BLOCK)
+    try:
+        with Path(path).open("wb") as file:
+            file.write(header.ljust(_BLOCK, b"\0") + build(start) + body + padding)
+    except OSError as e:
+        raise InputError(f"a file to write ({e.strerror})", source=path) from e
+
+
+def _parameter_section(demo: Demonstration, start: int) -> bytes:
+    """Groups and parameters, whole blocks."""
+    n, names = len(demo.t), demo.names
+    halves = [1, 0, n & 0xFFFF, n >> 16]
+    groups = {
+        "POINT": {
+            "USED": _shorts(len(names)),
+            "SCALE": _floats(-1.0),
+            "RATE": _floats(demo.rate),
+            "DATA_START": _shorts(start),
+            "FRAMES": _shorts(min(n, 65535)),
+            "LABELS": _strings(names),
+            "DESCRIPTIONS": _strings([""] * len(names)),
+            "UNITS": _strings(["mm"], flat=True),
+            "X_SCREEN": _strings(["+X"], flat=True),
+            "Y_SCREEN": _strings(["+Z"], flat=True),
+        },
+        "ANALOG": {
+            "USED": _shorts(0),
+            "LABELS": _strings([]),
+            "DESCRIPTIONS": _strings([]),
+            "GEN_SCALE": _floats(1.0),
+            "SCALE": struct.pack("<bBB", 4, 1, 0),
+            "OFFSET": struct.pack("<bBB", 2, 1, 0),
+            "UNITS": _strings([]),
+            "RATE": _floats(demo.rate),
+        },
+        "FORCE_PLATFORM": {"USED": _shorts(0)},
+        "TRIAL": {
+            "ACTUAL_START_FIELD": struct.pack("<bBB2H", 2, 1, 2, *halves[:2]),
+            "ACTUAL_END_FIELD": struct.pack("<bBB2H", 2, 1, 2, *halves[2:]),
+        },
+        "MANUFACTURER": {"SOFTWARE": _strings(["clamber"], flat=True)},
+    }
+    out = b""
+    for k, (group, parameters) in enumerate(groups.items(), start=1):
+        out += struct.pack("<bb", len(group), -k) + group.encode()
+        out += struct.pack("<hB", 3, 0)
+        for name, value in parameters.items():
+            out += struct.pack("<bb", len(name), k) + name.encode()
+            out += struct.pack("<h", 2 + len(value) + 1) + value + b"\0"
+    blocks = -(-(4 + len(out) + 2) // _BLOCK)
+    return (struct.pack("<BBBB", 1, KEY, blocks, _INTEL) + out).ljust(
+        blocks * _BLOCK, b"\0"
+    )
+
+
+def _shorts(value: int) -> bytes:
+    return struct.pack("<bBH", 2, 0, value)
+
+
+def _floats(value: float) -> bytes:
+    return struct.pack("<bBf", 4, 0, value)
+
+
+def _strings(words: list[str] | tuple[str, ...], flat: bool = False) -> bytes:
+    """Strings of equal width; `flat` is one string of one dimension."""
+    raw = [w.encode("latin-1", "replace")[:127] for w in words]
+    width = max([len(w) for w in raw], default=0)
+    sizes = [width] if flat else [width, len(raw)]
+    head = struct.pack(f"<bB{len(sizes)}B", -1, len(sizes), *sizes)
+    return head + b"".join(w.ljust(width) for w in raw)

@@ -1,0 +1,425 @@
+"""From any recording's file, with or without a `recording.yaml`, to a Demonstration.
+
+The readers say what is in a file; here it is decided what that means: which format it
+is, what the names are, which unit and which axis, and what of it becomes the record.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import pydantic
+
+from clamber.errors import InputError, unreadable
+from clamber.model.scene import Box, Scene, input_error, load_scene, read_yaml
+from clamber.model.se3 import matrix_from_quat
+from clamber.model.terrain import to_z_up
+from clamber.recording import arrays, bvh, c3d, motive, trc
+from clamber.recording.boxes import FLOOR, lower_to_ground, read_obj_boxes
+from clamber.recording.demonstration import (
+    MAX_GAP,
+    SIDES,
+    Demonstration,
+    build_demonstration,
+)
+from clamber.recording.levels import fit_levels
+from clamber.recording.marker_sets import (
+    Recognised,
+    known_point,
+    median_length,
+    recognise,
+    solve_centres,
+)
+from clamber.recording.points import MAX_RATE, METRES, Points, read_safely
+
+Rate = Annotated[float, pydantic.Field(gt=0.0, le=MAX_RATE, allow_inf_nan=False)]
+Seconds = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
+Name = Annotated[str, pydantic.Field(min_length=1)]
+Metres = Annotated[float, pydantic.Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+Scale = Annotated[float, pydantic.Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
+
+# Suffix, what the content begins with and at which byte, and the reader.
+_READERS: tuple[tuple[tuple[str, ...], int, bytes, Callable[[Path], Points]], ...] = (
+    ((".c3d",), 1, bytes([c3d.KEY]), c3d.read_c3d),
+    ((".trc",), 0, trc.MAGIC, trc.read_trc),
+    ((".bvh",), 0, bvh.MAGIC, bvh.read_bvh),
+    ((".csv",), 0, motive.MAGIC, motive.read_motive),
+    ((".npy",), 0, arrays.NPY_MAGIC, arrays.read_array),
+    ((".npz",), 0, arrays.NPZ_MAGIC, arrays.read_array),
+)
+YAML = (".yaml", ".yml")
+SUFFIXES = (*YAML, *(s for suffixes, *_ in _READERS for s in suffixes))
+
+
+class FixedPoint(pydantic.BaseModel):
+    """A point that is fixed to a rigid body or bone."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    body: Name
+    at: tuple[Metres, Metres, Metres]
+
+
+class RecordingFile(pydantic.BaseModel):
+    """What a recording does not say of itself (`recording.yaml`)."""
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    version: Literal[1] = 1
+    file: Name
+    names: Name | list[Name] | None = None
+    rate: Rate | None = None
+    unit: str | Scale | None = None
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    subject: Name | None = None
+    boxes: Name | None = None
+    ground: Name = FLOOR
+    span: tuple[Seconds, Seconds] | None = None
+    max_gap: Seconds = MAX_GAP
+    parts: dict[str, Name | list[Name] | FixedPoint] | None = None
+    offsets: dict[str, Metres] | None = None
+
+    @pydantic.field_validator("span")
+    @classmethod
+    def _increasing(
+        cls, span: tuple[float, float] | None
+    ) -> tuple[float, float] | None:
+        if span is not None and span[1] <= span[0]:
+            raise ValueError("expected an end after the start")
+        return span
+
+    @pydantic.field_validator("unit")
+    @classmethod
+    def _unit_of_length(cls, unit: str | float | None) -> str | float | None:
+        if isinstance(unit, str) and unit not in METRES:
+            raise ValueError(f"expected metres per unit or one of {', '.join(METRES)}")
+        return unit
+
+    @pydantic.field_validator("parts")
+    @classmethod
+    def _known(cls, parts: dict | None) -> dict | None:
+        for point in parts or {}:
+            if not known_point(point):
+                raise ValueError(f"expected a part such as LHand, found {point!r}")
+        return parts
+
+    @pydantic.field_validator("offsets")
+    @classmethod
+    def _kinds(cls, offsets: dict | None) -> dict | None:
+        for kind in offsets or {}:
+            if kind.split(".")[0] not in ("Hand", "Elbow", "Knee", "Foot"):
+                raise ValueError(
+                    "expected a part without its side, such as Knee or Foot.toe, "
+                    f"found {kind!r}"
+                )
+        return offsets
+
+
+def load_recording(
+    path: Path,
+    *,
+    scene: Scene | None = None,
+    names: str | Path | Sequence[str] | None = None,
+    rate: float | None = None,
+    span: tuple[float, float] | None = None,
+    fit_floor: bool = False,
+) -> Demonstration:
+    """Read a recording: a file of any known format, or the `recording.yaml` of one.
+
+    Raises:
+        InputError: The file, or one that it names, or one of its fields, cannot be
+            used.
+    """
+    if path.suffix.lower() in YAML:
+        given = read_yaml(path)
+    else:
+        if names is not None and not isinstance(names, (str, Path)):
+            listed: str | list[str] | None = list(names)
+        else:
+            listed = None if names is None else str(Path(names).absolute())
+        given = {"file": path.name, "names": listed, "rate": rate}
+    try:
+        said = RecordingFile.model_validate(given)
+    except pydantic.ValidationError as e:
+        raise input_error(e, path) from e
+    demo = _build(path, said, scene=scene, span=span or said.span)
+    return fit_levels(demo) if fit_floor else demo
+
+
+def read_points(
+    path: Path, *, names: Sequence[str] | None = None, rate: float | None = None
+) -> Points:
+    """Named points of a file, by the reader that its content, or its suffix, calls for.
+
+    Args:
+        path: The file.
+        names: Of the columns of a bare array.
+        rate: In place of the file's own, where it has one [Hz].
+
+    Raises:
+        InputError: No reader knows such a file, or it is damaged.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError as e:
+        raise unreadable(path, e) from e
+    plain = start.lstrip(b'\xef\xbb\xbf" \t\r\n')
+    by_content = [
+        r for _, at, magic, r in _READERS
+        if (plain if at == 0 else start)[at:].startswith(magic)
+    ]  # fmt: skip
+    by_suffix = [r for suffixes, *_, r in _READERS if path.suffix.lower() in suffixes]
+    # One byte tells little, so that a C3D file must also be called one.
+    certain = [r for r in by_content if r is not c3d.read_c3d or r in by_suffix]
+    reader = next(iter([*certain, *by_suffix]), None)
+    if reader is None:
+        raise InputError(
+            f"a recording: {', '.join(s for s in SUFFIXES if s not in YAML)}",
+            source=path,
+        )
+    if reader is arrays.read_array:
+        points = read_safely(
+            lambda p: arrays.read_array(p, names=names, rate=rate), path
+        )
+    else:
+        points = read_safely(reader, path)
+    return points if rate is None else replace(points, rate=rate)
+
+
+def _build(
+    path: Path,
+    said: RecordingFile,
+    *,
+    scene: Scene | None,
+    span: tuple[float, float] | None,
+) -> Demonstration:
+    """The record, in the coordinates in which the chosen ground is z = 0."""
+    folder = path.parent
+    names = _read_names(said.names, folder, path) if said.names else None
+    points = read_points(folder / said.file, names=names, rate=said.rate)
+    first, last = _span(span, len(points.position), points.rate, path)
+    labels, fixed = list(points.names), {}
+    parts: dict[str, str | list[str]] = {}
+    for part, what in (said.parts or {}).items():
+        if isinstance(what, FixedPoint):
+            fixed[len(labels)] = what
+            label = f"{part} fixed to {what.body}"
+            parts[part] = label
+            labels.append(label)
+        else:
+            parts[part] = what
+    found = recognise(labels, parts=parts, subject=said.subject, source=path)
+    with np.errstate(invalid="ignore"):  # NaN of any kind
+        raw = {
+            c: points.position[first:last, c].astype(float)
+            for c in found.used()
+            if c not in fixed
+        }
+    unit, why_unit = _unit(said, points, found, raw, path)
+    for column, what in fixed.items():
+        raw[column] = _fixed(points, what, unit, path)[first:last]
+    up, why_up = _up(said, points, found, raw)
+    track = {c: unit * to_z_up(x, up) for c, x in raw.items()}
+    solved = solve_centres(found, track)
+    position = np.stack(list(solved.values()), axis=1)
+
+    given = _boxes(said, folder, unit, up) if scene is None else scene
+    boxes, level = lower_to_ground(list(given.boxes), said.ground, path)
+    position[..., 2] -= level
+    placed = replace(
+        given, boxes=boxes, start=_start(position, list(solved)), goal=None
+    )
+    return build_demonstration(
+        position,
+        names=list(solved),
+        rate=points.rate,
+        scene=placed,
+        source=str(path),
+        t0=first / points.rate,
+        max_gap=said.max_gap,
+        offsets=said.offsets,
+        raised=found.raised,
+        notes=(
+            f"recognised: {found.name} ({len(points.names)} points at "
+            f"{points.rate:g} Hz)",
+            f"unit: {unit:g} m ({why_unit}); up: {up} ({why_up})",
+        ),
+    )
+
+
+# Where a file does not say its unit the shank does: no two of these agree.
+_SHANK = (0.28, 0.56)  # [m] of a person's, from a small one's to a tall one's
+_GUESSES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254, "CMU's": 0.0254 / 0.45}
+# Where there are markers on the skin instead of a joint.
+_ON_SKIN = {
+    "Foot": "AnkleOut",
+    "Knee": "KneeOut",
+    "Hip": "Asis",
+    "Shoulder": "Acromion",
+}
+
+
+def _columns(found: Recognised, point: str) -> tuple[int, ...]:
+    """Columns near a canonical point, before any centre is computed."""
+    place = point[0] + _ON_SKIN[point[1:]]
+    return found.columns[point if point in found.columns else place]
+
+
+def _near(
+    found: Recognised, raw: Mapping[int, np.ndarray], joint: str
+) -> dict[str, np.ndarray]:
+    return {
+        s: np.mean([raw[c] for c in _columns(found, s + joint) if c in raw], axis=0)
+        for s in SIDES
+        if any(c in raw for c in _columns(found, s + joint))
+    }
+
+
+def _unit(
+    said: RecordingFile,
+    points: Points,
+    found: Recognised,
+    raw: Mapping[int, np.ndarray],
+    path: Path,
+) -> tuple[float, str]:
+    """Metres per unit, and who says so."""
+    if said.unit is not None:
+        unit = METRES[said.unit] if isinstance(said.unit, str) else said.unit
+        return unit, "recording.yaml"
+    if points.unit is not None:
+        return points.unit, "the file"
+    knee, ankle = (_near(found, raw, j) for j in ("Knee", "Foot"))
+    both = [s for s in SIDES if s in knee and s in ankle]
+    lengths = [np.linalg.norm(knee[s] - ankle[s], axis=1) for s in both]
+    known = [x[np.isfinite(x)] for x in lengths]
+    if not any(len(x) for x in known):
+        return 1.0, "nothing says otherwise"  # never seen: the next step says so
+    shank = float(np.median(np.concatenate(known)))
+    for name, unit in _GUESSES.items():
+        if _SHANK[0] <= shank * unit <= _SHANK[1]:
+            return unit, f"the shank is {shank:.4g} long, so these are {name}"
+    raise InputError(
+        f"the unit of length (m, cm, mm or metres per unit): the shank is {shank:.4g} "
+        "units long",
+        source=path,
+        field="unit",
+    )
+
+
+_UPRIGHT = 0.85  # of the length from ankles over knees and hips to shoulders: it stands
+
+
+def _up(
+    said: RecordingFile,
+    points: Points,
+    found: Recognised,
+    raw: Mapping[int, np.ndarray],
+) -> tuple[str, str]:
+    """The axis that points up, and who says so.
+
+    It is what the file says, or else what is usual for the format, unless the person
+    stands straight along another axis at some time and never along this one.
+    """
+    if said.up is not None:
+        return said.up, "recording.yaml"
+    usual = points.usual_up if points.up is None else points.up
+    chain = [_near(found, raw, j) for j in ("Foot", "Knee", "Hip", "Shoulder")]
+    both = [s for s in SIDES if all(s in joint for joint in chain)]
+    if both:
+        middle = [np.mean([joint[s] for s in both], axis=0) for joint in chain]
+        body = sum(median_length(b - a) for a, b in pairwise(middle))
+        way = middle[-1] - middle[0]
+        way = way[np.isfinite(way).all(axis=1)]
+        if len(way):
+            reach = {
+                sign + a: float(np.percentile((-1 if sign else 1) * way[:, k], 95))
+                for k, a in enumerate("xyz")
+                for sign in ("", "-")
+            }
+            best = max(reach, key=lambda a: reach[a])
+            if reach[usual] < _UPRIGHT * body <= reach[best]:
+                return best, f"the person stands along it, not along {usual}"
+    return usual, "usual" if points.up is None else "the file"
+
+
+def _fixed(points: Points, what: FixedPoint, unit: float, path: Path) -> np.ndarray:
+    """(T, 3) of a point fixed to a body, in the file's unit and axes."""
+    if what.body not in points.orientation:
+        raise InputError(
+            f"a rigid body or bone with rotations: {sorted(points.orientation)}",
+            source=path,
+            field="parts: body",
+            value=what.body,
+        )
+    quaternion = points.orientation[what.body]
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    R = matrix_from_quat(quaternion / np.where(length > 0, length, np.nan))
+    place = points.position[:, points.names.index(what.body)]
+    return place + R @ (np.array(what.at) / unit)
+
+
+def _read_names(names: str | list[str], folder: Path, source: Path) -> list[str]:
+    """Names as they are listed, or from the JSON file that lists them."""
+    if isinstance(names, str):
+        path = folder / names
+        try:
+            names = json.loads(path.read_text())
+        except OSError as e:
+            raise unreadable(path, e) from e
+        except (ValueError, RecursionError) as e:
+            raise InputError("a JSON list of names", source=path) from e
+        source = path
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise InputError("a list of names", source=source, field="names")
+    return names
+
+
+def _span(
+    span: tuple[float, float] | None, n: int, rate: float, source: Path
+) -> tuple[int, int]:
+    """Half-open range of samples of a span [s]."""
+    if span is None:
+        return 0, n
+    end = (n - 1) / rate
+    first = int(np.ceil(min(span[0], end + 1.0) * rate - 1e-6))
+    last = min(int(np.floor(min(span[1], end) * rate + 1e-6)) + 1, n)
+    if span[0] < 0 or last - first < 2:
+        raise InputError(
+            f"a stretch between 0 and {end:.2f} s with at least two samples",
+            source=source,
+            field="span",
+            value=list(span),
+        )
+    return first, last
+
+
+def _boxes(said: RecordingFile, folder: Path, unit: float, up: str) -> Scene:
+    """The scene that `boxes` names, without a start of its own yet."""
+    boxes: list[Box] = []
+    if said.boxes is not None:
+        path = folder / said.boxes
+        if path.suffix.lower() in YAML:
+            return load_scene(path)
+        if path.suffix.lower() != ".obj":
+            raise InputError("an .obj or a scene.yaml", source=path, field="boxes")
+        boxes = read_obj_boxes(path, unit, up)
+    return Scene(boxes=tuple(boxes), start=np.zeros(3))
+
+
+def _start(raw: np.ndarray, points: list[str]) -> np.ndarray:
+    """Ankles' midpoint and the way the hips face, where first all are seen."""
+    track = {s + p: raw[:, points.index(s + p)] for s in SIDES for p in ("Foot", "Hip")}
+    seen = np.all([np.isfinite(x).all(axis=1) for x in track.values()], axis=0)
+    if not seen.any():
+        return np.zeros(3)
+    first = {n: x[np.argmax(seen)] for n, x in track.items()}
+    middle = (first["LFoot"] + first["RFoot"]) / 2
+    left = first["LHip"] - first["RHip"]
+    return np.array([middle[0], middle[1], np.arctan2(-left[0], left[1])])

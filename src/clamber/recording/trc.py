@@ -1,0 +1,129 @@
+"""TRC, the marker files of OpenSim: tab-separated text with five lines of heading."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from clamber.errors import InputError
+from clamber.recording.demonstration import Demonstration
+from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
+from clamber.recording.table import check_count, place_rows, read_blocks
+
+MAGIC = b"PathFileType"
+_HEADING = 1 << 20  # [byte] a longer line of heading is none
+
+
+def read_trc(path: Path) -> Points:
+    """Markers of a TRC file; empty cells are gaps.
+
+    The heading does not say which axis is up: y is usual.
+
+    Raises:
+        InputError: It is no such file, with the line and what was expected there.
+        OSError: It cannot be opened.
+    """
+    with path.open("rb") as file:
+        heading = [
+            file.readline(_HEADING).decode("utf-8", "replace").rstrip("\r\n")
+            for _ in range(5)
+        ]
+        if not heading[0].startswith(MAGIC.decode()):
+            raise InputError("`PathFileType`", source=path, field="line 1")
+        keys, values = heading[1].split("\t"), heading[2].split("\t")
+        said = {
+            k.strip().lower(): v.strip() for k, v in zip(keys, values, strict=False)
+        }
+        rate = _number(said, "DataRate", path)
+        count = _number(said, "NumMarkers", path)
+        if "units" not in said:
+            raise InputError("`Units` in the heading", source=path, field="line 2")
+        unit = unit_of(said["units"], path, "line 3, Units")
+        names = [n.strip() for n in heading[3].split("\t")]
+        if [n.lower() for n in names[:2]] != ["frame#", "time"]:
+            raise InputError(
+                "`Frame#`, `Time` and the markers' names", source=path, field="line 4"
+            )
+        names = [n for n in names[2:] if n]
+        if len(names) != count or not 0 < count <= MAX_POINTS:
+            raise InputError(
+                f"as many names as NumMarkers says ({count:g})",
+                source=path,
+                field="line 4",
+                value=len(names),
+            )
+        line, place = 6, file.tell()
+        while (text := file.readline(_HEADING)) and not text.strip():
+            line, place = line + 1, file.tell()  # a line between heading and rows
+        file.seek(place)
+        first, numbers, blocks = line, [], []
+        for rows in read_blocks(
+            file, columns=2 + 3 * len(names), delimiter="\t", line=line, source=path
+        ):
+            numbers.append(rows[:, 0])
+            blocks.append(rows[:, 2:].reshape(len(rows), len(names), 3))
+    if not blocks:
+        raise InputError("rows of numbers", source=path, field=f"line {first}")
+    number = np.concatenate(numbers)
+    if "numframes" in said:
+        expected = _number(said, "NumFrames", path)
+        check_count(len(number), expected, line=first, what="NumFrames", source=path)
+    return Points(
+        names=unique_names(names),
+        position=place_rows(
+            number, np.concatenate(blocks), line=first, what="Frame#", source=path
+        ),
+        rate=rate,
+        unit=unit,
+        usual_up="y",
+    )
+
+
+def _number(said: dict[str, str], key: str, path: Path) -> float:
+    """A number of the heading."""
+    text = said.get(key.lower())
+    try:
+        return float(text or "")
+    except ValueError as e:
+        raise InputError(
+            f"`{key}` with a number below it", source=path, field="line 3", value=text
+        ) from e
+
+
+def write_trc(demo: Demonstration, path: str | Path) -> None:
+    """Write a demonstration's points as TRC: millimetres, y up, gaps as empty cells.
+
+    Opens in OpenSim. The boxes are not part of the file: `recording.yaml` names them.
+
+    Args:
+        demo: What to write; long gaps stay gaps, short ones are as filled.
+        path: The file.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    path = Path(path)
+    rate, n, f = demo.rate, len(demo.t), len(demo.names)
+    heading = (
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}\n"
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\t"
+        "OrigDataStartFrame\tOrigNumFrames\n"
+        f"{rate:.10g}\t{rate:.10g}\t{n}\t{f}\tmm\t{rate:.10g}\t1\t{n}\n"
+        + "Frame#\tTime\t" + "\t\t\t".join(demo.names) + "\t\t\n"
+        + "\t\t" + "\t".join(f"{a}{k}" for k in range(1, f + 1) for a in "XYZ") + "\n"
+        + "\n"
+    )  # fmt: skip
+    p = 1000.0 * demo.position
+    p = np.stack([p[..., 0], p[..., 2], -p[..., 1]], axis=-1)
+    try:
+        with path.open("w", encoding="utf-8", newline="\n") as file:
+            file.write(heading)
+            for k, (t, row, seen) in enumerate(zip(demo.t, p, demo.valid, strict=True)):
+                cells = [
+                    f"{x:.4f}\t{y:.4f}\t{z:.4f}" if ok else "\t\t"
+                    for (x, y, z), ok in zip(row.tolist(), seen, strict=True)
+                ]
+                file.write(f"{k + 1}\t{t:.6f}\t" + "\t".join(cells) + "\n")
+    except OSError as e:
+        raise InputError(f"a file to write ({e.strerror})", source=path) from e

@@ -1,0 +1,1 @@
+"""A run on disk, and for other people's tools."""

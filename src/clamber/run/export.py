@@ -1,0 +1,637 @@
+"""Run folder -> one file that other people's tools read: CSV, MCAP or npz.
+
+What is exported is what was followed: the reference of the run, at a whole fraction of
+its 1 kHz, with its contact schedule and, where physics has run, the forces on its
+surfaces. On request a motion from the posture that was measured on the robot to the
+first one comes before it.
+
+Shapes: T samples, na joints, nS surfaces, nb bodies of the robot.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from numbers import Real
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import mujoco
+import numpy as np
+
+from clamber.errors import InputError, MissingDependency
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.scene import read_yaml
+from clamber.model.world import World
+from clamber.planning.records import Plan
+from clamber.planning.trajectory import RATE, Trajectory, holding_torque
+from clamber.run.folder import (
+    ROLLOUT,
+    load_plan,
+    load_rollout,
+    trajectory_of,
+    whole_file,
+)
+
+Format = Literal["csv", "mcap", "npz"]
+Layout = Literal["mjlab", "holosoma"]
+# [Hz] of each format: controllers go through positions and velocities by cubic splines,
+# and states of a rollout are recorded at 100; trainers step their policies at 50.
+DEFAULT_RATE: Mapping[str, int] = {"csv": 100, "mcap": 100, "npz": 50}
+LEAD_IN_SPEED = 0.5  # [rad/s] of the fastest joint
+PEAK = 1.875  # largest over mean speed of a minimum-jerk motion
+CHECK_STEP = 0.01  # [rad] of the fastest joint between two looks at distances
+TORQUE_NODES = 11  # postures of a lead-in whose torques are computed
+WORLD = "world"  # the fixed frame of MCAP's messages
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Motion:
+    """What is exported, sampled.
+
+    Attributes:
+        world: As planned.
+        rate: [Hz].
+        lead_in: Samples before the run itself.
+        q: (T, nq); v: (T, nv) its derivative on the manifold; tau: (T, na) [N m].
+        contact: (T, nS) bool; surfaces in the order of `world`.
+        force: (T, nS, 3) on each surface in physics [N], in the world; zero in the
+            lead-in, which physics has not run; None where there is no rollout.
+        state: q, v and joint torques as physics made them, where it has run; else
+            those above.
+    """
+
+    world: World
+    rate: int
+    lead_in: int
+    q: np.ndarray
+    v: np.ndarray
+    tau: np.ndarray
+    contact: np.ndarray
+    force: np.ndarray | None
+    state: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    @property
+    def time(self) -> np.ndarray:
+        """(T,) [s], from the first sample."""
+        return np.arange(len(self.q)) / self.rate
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Exported:
+    """What was written.
+
+    Attributes:
+        file: Where.
+        rate: [Hz]; samples: how many.
+        lead_in: [s] before the run itself.
+        forces: Contact forces are in it, because physics has run.
+    """
+
+    file: Path
+    rate: int
+    samples: int
+    lead_in: float
+    forces: bool
+
+
+def export_run(
+    folder: str | Path,
+    *,
+    to: Format,
+    out: str | Path | None = None,
+    rate: int | None = None,
+    lead_in: str | Path | Mapping[str, float] | None = None,
+    lead_in_speed: float = LEAD_IN_SPEED,
+    layout: Layout | None = None,
+) -> Exported:
+    """Write the motion of a run for other tools.
+
+    Args:
+        folder: A run folder that holds a plan.
+        to: `csv`; `mcap`: ROS 2 messages; `npz`: for whole-body tracking.
+        out: The file; `motion.<to>` in the run folder by default.
+        rate: [Hz] a divisor of 1000; 100 for `csv` and `mcap`, 50 for `npz` by default.
+        lead_in: Measured joint angles [rad] by name, the file that holds them, or
+            `home`: a motion from there to the first posture comes first.
+        lead_in_speed: Largest joint speed of that motion [rad/s].
+        layout: What `joint_pos` and `joint_vel` of an npz hold: the joints alone, as
+            mjlab reads (the default), or qpos and qvel, as holosoma reads.
+
+    Raises:
+        InputError: There is nothing to export, or an argument cannot be used.
+        MissingDependency: `mcap` without its packages.
+    """
+    if to not in get_args(Format):
+        raise InputError(
+            f"one of {', '.join(get_args(Format))}", source="--to", value=to
+        )
+    if layout is not None and to != "npz":
+        raise InputError(
+            "no layout for this format: it goes with --to npz",
+            source="--layout",
+            value=layout,
+        )
+    if layout not in (None, *get_args(Layout)):
+        raise InputError(
+            f"one of {', '.join(get_args(Layout))}", source="--layout", value=layout
+        )
+    folder = Path(folder)
+    file = folder / f"motion.{to}" if out is None else Path(out)
+    motion = load_motion(
+        folder,
+        rate=DEFAULT_RATE[to] if rate is None else rate,
+        lead_in=lead_in,
+        lead_in_speed=lead_in_speed,
+    )
+    try:
+        with whole_file(file) as draft:
+            if to == "csv":
+                _write_csv(motion, draft)
+            elif to == "mcap":
+                _write_mcap(motion, draft)
+            else:
+                _write_npz(motion, draft, layout or "mjlab")
+    except OSError as e:
+        raise InputError(
+            f"a file that can be written ({e.strerror or e})",
+            source="--out",
+            value=str(file),
+        ) from e
+    return Exported(
+        file=file,
+        rate=motion.rate,
+        samples=len(motion.q),
+        lead_in=motion.lead_in / motion.rate,
+        forces=motion.force is not None,
+    )
+
+
+# What is exported.
+
+
+def load_motion(
+    folder: str | Path,
+    *,
+    rate: int,
+    lead_in: str | Path | Mapping[str, float] | None = None,
+    lead_in_speed: float = LEAD_IN_SPEED,
+) -> Motion:
+    """Read what a run followed, at `rate` [Hz]; the arguments of `export_run`.
+
+    A run that fell ends where it fell.
+
+    Raises:
+        InputError: As `export_run`.
+    """
+    folder = Path(folder)
+    if rate <= 0 or RATE % rate:
+        raise InputError(
+            f"a divisor of {RATE:.0f} Hz, as 50 or 100", source="--rate", value=rate
+        )
+    plan = load_plan(folder)
+    reference = trajectory_of(plan, folder)
+    rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
+    motion = _sampled(plan, reference, rollout, rate)
+    if lead_in is None:
+        return motion
+    measured = measured_posture(plan.world, lead_in)
+    return _with_lead_in(motion, plan, measured, lead_in_speed)
+
+
+def _sampled(
+    plan: Plan, reference: Trajectory, rollout: Rollout | None, rate: int
+) -> Motion:
+    """The reference on the grid of `rate`; states and forces held since the last one.
+
+    Sample k of the reference is the command of physics step k.
+    """
+    t = reference
+    world = plan.world
+    n = len(t.time)
+    if rollout is not None:
+        t = rollout.followed or t
+        n = min(len(t.time), len(rollout.ctrl))
+    k = np.arange(0, n, round(RATE / rate))
+    q, v, tau = t.q[k], t.v[k], t.tau[k]
+    if rollout is None:
+        state, force = (q, v, tau), None
+    else:
+        if rollout.followed is not None:
+            v = _with_base_velocity(Kinematics(world), q, v, rate)
+        j = k // rollout.stride
+        order = [rollout.world.model.actuator(name).id for name in world.joints]
+        effort = rollout.actuator_force[j][:, order]
+        state, force = (
+            (rollout.qpos[j], rollout.qvel[j], effort),
+            rollout.contact_force[j],
+        )
+    return Motion(
+        world=world,
+        rate=rate,
+        lead_in=0,
+        q=q,
+        v=v,
+        tau=tau,
+        contact=t.contact[k],
+        force=force,
+        state=state,
+    )
+
+
+def _with_base_velocity(
+    kin: Kinematics, q: np.ndarray, v: np.ndarray, rate: int
+) -> np.ndarray:
+    """`v` (T, nv) with that of the base by differences of q: execution keeps none."""
+    out, last = v.copy(), len(q) - 1
+    for k in range(len(q)):
+        a, b = max(k - 1, 0), min(k + 1, last)
+        if b > a:
+            out[k, :6] = kin.difference(q[a], q[b])[:6] * rate / (b - a)
+    return out
+
+
+# Lead-in.
+
+
+def measured_posture(
+    world: World, given: str | Path | Mapping[str, float]
+) -> np.ndarray:
+    """(na,) joint angles [rad] in the world's order.
+
+    Args:
+        world: Of the robot.
+        given: Angles by joint, a YAML or JSON file of them, or `home`.
+
+    Raises:
+        InputError: A joint is unknown, missing, no number, or beyond its limits.
+    """
+    if isinstance(given, Mapping):
+        source, angles = "lead_in", given
+    elif str(given) == "home":
+        return world.home[world.qadr].copy()
+    else:
+        source, angles = given, read_yaml(Path(given))
+    for name in angles:
+        if name not in world.joints:
+            raise InputError(
+                f"a joint of {world.robot.name}: {', '.join(world.joints)}",
+                source=source,
+                field=str(name),
+            )
+    if missing := [j for j in world.joints if j not in angles]:
+        raise InputError(
+            "an angle of every joint: there is none", source=source, field=missing[0]
+        )
+    out = np.empty(len(world.joints))
+    for i, name in enumerate(world.joints):
+        low, high = (x[world.dadr[i]] for x in (world.q_min, world.q_max))
+        x = angles[name]
+        number = isinstance(x, Real) and not isinstance(x, bool)
+        if not number or not low <= x <= high:  # NaN is not either
+            raise InputError(
+                f"{low:.4g} to {high:.4g} rad, its limits",
+                source=source,
+                field=name,
+                value="nothing" if x is None else x,
+            )
+        out[i] = x
+    return out
+
+
+def _with_lead_in(
+    motion: Motion, plan: Plan, measured: np.ndarray, speed: float
+) -> Motion:
+    """A straight line in joint angles, along it a minimum-jerk profile, before all.
+
+    s(x) = 10 x^3 - 15 x^4 + 6 x^5 over x = t / T, at rest at both ends; its largest
+    speed is 15/8 of the mean [Flash85]. The base stays where it is at the start.
+    """
+    if not (speed > 0 and math.isfinite(speed)):
+        raise InputError("more than 0 rad/s", source="--lead-in-speed", value=speed)
+    world = motion.world
+    way = motion.q[0, world.qadr] - measured
+    limit = np.minimum(speed, world.v_max[world.dadr])
+    seconds = PEAK * float((np.abs(way) / limit).max(initial=0.0))
+    n = math.ceil(seconds * motion.rate)
+    if n == 0:
+        return motion
+    _check_lead_in(motion, plan, measured)
+    x = np.arange(n) / n
+    s = x**3 * (10 - 15 * x + 6 * x**2)
+    rate = 30 * x**2 * (1 - x) ** 2 * motion.rate / n
+    q = np.tile(motion.q[0], (n, 1))
+    q[:, world.qadr] = measured + s[:, None] * way
+    v = np.zeros((n, world.model.nv))
+    v[:, world.dadr] = rate[:, None] * way
+    tau = _lead_in_torques(motion, plan, measured, s)
+    force = motion.force
+    if force is not None:
+        force = np.concatenate([np.zeros((n, *force.shape[1:])), force])
+    return Motion(
+        world=world,
+        rate=motion.rate,
+        lead_in=n,
+        q=np.concatenate([q, motion.q]),
+        v=np.concatenate([v, motion.v]),
+        tau=np.concatenate([tau, motion.tau]),
+        contact=np.concatenate(
+            [np.repeat(motion.contact[:1], n, axis=0), motion.contact]
+        ),
+        force=force,
+        state=(
+            np.concatenate([q, motion.state[0]]),
+            np.concatenate([v, motion.state[1]]),
+            np.concatenate([tau, motion.state[2]]),
+        ),
+    )
+
+
+def _on_the_way(motion: Motion, measured: np.ndarray, share: float) -> np.ndarray:
+    """(nq,) the posture after a share of the way."""
+    q = motion.q[0].copy()
+    adr = motion.world.qadr
+    q[adr] = measured + share * (q[adr] - measured)
+    return q
+
+
+def _check_lead_in(motion: Motion, plan: Plan, measured: np.ndarray) -> None:
+    """Refuse a way on which links meet each other or the scene.
+
+    A surface against the support that it stands on is not looked at: where the legs
+    are bent more or less than in the first posture, the base gives way, which is held
+    here.
+    """
+    world = motion.world
+    kin = Kinematics(world)
+    standing = {
+        (g, world.support_geom[c.support])
+        for c in plan.keyframes[0].stance
+        for g in world.surfaces[c.surface].geoms
+    }
+    looked_at = np.array(
+        [not {(a, b), (b, a)} & standing for a, b in world.pairs.tolist()]
+    )
+    way = float(np.abs(motion.q[0, world.qadr] - measured).max())
+    for share in np.linspace(0.0, 1.0, math.ceil(way / CHECK_STEP) + 1):
+        kin.update(_on_the_way(motion, measured, float(share)))
+        near = kin.proximity(0.0, looked_at)
+        if len(near.distance):
+            i = int(np.argmin(near.distance))
+            a, b = (world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]])
+            where = f"after {100 * share:.0f} % of the way" if share else "in it"
+            raise InputError(
+                "a measured posture from which the first one is reached in a straight"
+                f" line: {a} and {b} would meet {where}",
+                source="--lead-in",
+            )
+
+
+def _lead_in_torques(
+    motion: Motion, plan: Plan, measured: np.ndarray, s: np.ndarray
+) -> np.ndarray:
+    """(n, na) that hold the postures on the first contacts, after shares `s` (n,)."""
+    kin = Kinematics(motion.world)
+    stance = plan.keyframes[0].stance
+    nodes = np.linspace(0.0, 1.0, TORQUE_NODES)
+    held = np.array(
+        [holding_torque(kin, _on_the_way(motion, measured, x), stance) for x in nodes]
+    )
+    held[-1] = motion.tau[0]
+    return np.stack([np.interp(s, nodes, column) for column in held.T], axis=1)
+
+
+# CSV.
+
+
+def _write_csv(m: Motion, path: Path) -> None:
+    """One row a sample; numbers in their shortest exact form, units in the header."""
+    w = m.world
+    header = ["time [s]"]
+    header += [f"base {a} [m]" for a in "xyz"] + [f"base q{a} [-]" for a in "wxyz"]
+    header += [f"base v{a} [m/s]" for a in "xyz"]
+    header += [f"base w{a} [rad/s]" for a in "xyz"]
+    columns = [m.time[:, None], m.q[:, :7], m.v[:, :6]]
+    for what, values in (
+        ("position [rad]", m.q[:, w.qadr]),
+        ("velocity [rad/s]", m.v[:, w.dadr]),
+        ("torque [N m]", m.tau),
+    ):
+        header += [f"{j} {what}" for j in w.joints]
+        columns.append(values)
+    header += [f"{s} contact [-]" for s in w.surfaces]
+    if m.force is not None:
+        header += [f"{s} force {a} [N]" for s in w.surfaces for a in "xyz"]
+    numbers = np.concatenate(columns, axis=1).tolist()
+    flags = m.contact.astype(int).tolist()
+    forces = (
+        [[]] * len(m.q) if m.force is None else m.force.reshape(len(m.q), -1).tolist()
+    )
+    with path.open("w", newline="") as stream:
+        out = csv.writer(stream, lineterminator="\n")
+        out.writerow(header)
+        out.writerows(
+            [*a, *b, *c] for a, b, c in zip(numbers, flags, forces, strict=True)
+        )
+
+
+# npz.
+
+
+def body_states(
+    world: World, q: np.ndarray, v: np.ndarray
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Names of the robot's bodies, (T, nb, 3) positions, (T, nb, 4) orientations wxyz.
+
+    Then (T, nb, 3) velocities of the frames' origins and (T, nb, 3) angular velocities,
+    all in the world.
+    """
+    m = world.model
+    bodies = np.flatnonzero(m.body_rootid == m.body_rootid[world.base])
+    data = mujoco.MjData(m)
+    position = np.empty((len(q), len(bodies), 3))
+    orientation = np.empty((len(q), len(bodies), 4))
+    twist = np.empty((len(q), len(bodies), 6))
+    kind = mujoco.mjtObj.mjOBJ_XBODY
+    for k in range(len(q)):
+        data.qpos[:], data.qvel[:] = q[k], v[k]
+        mujoco.mj_kinematics(m, data)
+        mujoco.mj_comPos(m, data)
+        mujoco.mj_comVel(m, data)
+        position[k], orientation[k] = data.xpos[bodies], data.xquat[bodies]
+        for i, b in enumerate(bodies):
+            mujoco.mj_objectVelocity(m, data, kind, int(b), twist[k, i], 0)
+    names = [m.body(int(b)).name for b in bodies]
+    return names, position, orientation, twist[..., 3:], twist[..., :3]
+
+
+def _write_npz(m: Motion, path: Path, layout: Layout) -> None:
+    """Arrays without pickle, by the names that trackers read."""
+    w = m.world
+    names, position, orientation, linear, angular = body_states(w, m.q, m.v)
+    joints = layout == "mjlab"
+    arrays: dict[str, Any] = {
+        "fps": np.array([m.rate]),
+        "qpos": m.q,
+        "qvel": m.v,
+        "joint_names": np.array(w.joints),
+        "joint_pos": m.q[:, w.qadr] if joints else m.q,
+        "joint_vel": m.v[:, w.dadr] if joints else m.v,
+        "joint_torque": m.tau,
+        "body_names": np.array(names),
+        "body_pos_w": position,
+        "body_quat_w": orientation,
+        "body_lin_vel_w": linear,
+        "body_ang_vel_w": angular,
+        "surfaces": np.array(list(w.surfaces)),
+        "contact": m.contact,
+    }
+    if m.force is not None:
+        arrays["contact_force"] = m.force
+    with path.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)
+
+
+# MCAP: ROS 2's messages, as its bag files hold them.
+
+_RULE = "=" * 80
+_TIME = "builtin_interfaces/Time", "int32 sec\nuint32 nanosec"
+_DURATION = "builtin_interfaces/Duration", "int32 sec\nuint32 nanosec"
+_HEADER = "std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id"
+_VECTOR = "geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z"
+_QUATERNION = (
+    "geometry_msgs/Quaternion",
+    "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+)
+_POINT = (
+    "trajectory_msgs/JointTrajectoryPoint",
+    "float64[] positions # [rad]\n"
+    "float64[] velocities # [rad/s]\n"
+    "float64[] accelerations # [rad/s^2]\n"
+    "float64[] effort # [N m]\n"
+    "builtin_interfaces/Duration time_from_start",
+)
+_WRENCH = (
+    "geometry_msgs/Wrench",
+    "geometry_msgs/Vector3 force # [N]\ngeometry_msgs/Vector3 torque # [N m]",
+)
+_TRANSFORM = (
+    "geometry_msgs/Transform",
+    "geometry_msgs/Vector3 translation # [m]\ngeometry_msgs/Quaternion rotation",
+)
+_STAMPED = (
+    "geometry_msgs/TransformStamped",
+    "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform",
+)
+# A message: its own fields, then the types that they mention.
+SCHEMAS: Mapping[str, tuple[str, tuple[tuple[str, str], ...]]] = {
+    "trajectory_msgs/msg/JointTrajectory": (
+        "std_msgs/Header header\nstring[] joint_names\n"
+        "trajectory_msgs/JointTrajectoryPoint[] points",
+        (_HEADER, _POINT, _TIME, _DURATION),
+    ),
+    "sensor_msgs/msg/JointState": (
+        "std_msgs/Header header\nstring[] name\nfloat64[] position # [rad]\n"
+        "float64[] velocity # [rad/s]\nfloat64[] effort # [N m]",
+        (_HEADER, _TIME),
+    ),
+    "tf2_msgs/msg/TFMessage": (
+        "geometry_msgs/TransformStamped[] transforms",
+        (_STAMPED, _HEADER, _TRANSFORM, _VECTOR, _QUATERNION, _TIME),
+    ),
+    "std_msgs/msg/Bool": ("bool data", ()),
+    "geometry_msgs/msg/WrenchStamped": (
+        "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
+        (_HEADER, _WRENCH, _VECTOR, _TIME),
+    ),
+}
+
+
+def _write_mcap(m: Motion, path: Path) -> None:
+    """The trajectory as two messages at time zero, all else sample by sample."""
+    try:
+        from mcap_ros2.writer import Writer
+    except ImportError as e:
+        raise MissingDependency("mcap-ros2-support", "export") from e
+    base = m.world.model.body(m.world.base).name
+    with path.open("wb") as stream, Writer(stream) as writer:
+        schemas = {
+            name: writer.register_msgdef(name, _message_definition(name))
+            for name in SCHEMAS
+        }
+
+        def write(
+            topic: str, kind: str, stamp: int, message: Mapping[str, Any]
+        ) -> None:
+            writer.write_message(topic, schemas[kind], message, stamp, stamp)
+
+        for topic, effort in (
+            ("/joint_trajectory", False),
+            ("/joint_trajectory_with_torques", True),
+        ):
+            kind = "trajectory_msgs/msg/JointTrajectory"
+            write(topic, kind, 0, _trajectory_message(m, with_effort=effort))
+        q, v, effort = m.state
+        for k in range(len(m.q)):
+            ns = k * (1_000_000_000 // m.rate)
+            header = {"stamp": _time(ns), "frame_id": WORLD}
+            joints = {
+                "header": header,
+                "name": list(m.world.joints),
+                "position": q[k, m.world.qadr].tolist(),
+                "velocity": v[k, m.world.dadr].tolist(),
+                "effort": effort[k].tolist(),
+            }
+            write("/joint_states", "sensor_msgs/msg/JointState", ns, joints)
+            transform = {
+                "translation": _xyz(q[k, :3]),
+                "rotation": {**_xyz(q[k, 4:7]), "w": float(q[k, 3])},
+            }
+            moved = {"header": header, "child_frame_id": base, "transform": transform}
+            write("/tf", "tf2_msgs/msg/TFMessage", ns, {"transforms": [moved]})
+            for i, surface in enumerate(m.world.surfaces):
+                closed = {"data": bool(m.contact[k, i])}
+                write(f"/contact/{surface}", "std_msgs/msg/Bool", ns, closed)
+                if m.force is not None:
+                    wrench = {"force": _xyz(m.force[k, i]), "torque": _xyz(np.zeros(3))}
+                    message = {"header": header, "wrench": wrench}
+                    kind = "geometry_msgs/msg/WrenchStamped"
+                    write(f"/force/{surface}", kind, ns, message)
+
+
+def _trajectory_message(m: Motion, *, with_effort: bool) -> dict[str, Any]:
+    """A `JointTrajectory`; stamp zero starts it at once.
+
+    Torques are not in the one that `joint_trajectory_controller` is sent: it refuses
+    those, unless it commands efforts.
+    """
+    points = [
+        {
+            "positions": m.q[k, m.world.qadr].tolist(),
+            "velocities": m.v[k, m.world.dadr].tolist(),
+            "effort": m.tau[k].tolist() if with_effort else [],
+            "time_from_start": _time(k * (1_000_000_000 // m.rate)),
+        }
+        for k in range(len(m.q))
+    ]
+    header = {"stamp": _time(0), "frame_id": ""}
+    return {"header": header, "joint_names": list(m.world.joints), "points": points}
+
+
+def _message_definition(name: str) -> str:
+    """The text of a message's definition with all that it mentions."""
+    own, others = SCHEMAS[name]
+    return (
+        "\n".join([own, *(f"{_RULE}\nMSG: {n}\n{text}" for n, text in others)]) + "\n"
+    )
+
+
+def _time(ns: int) -> dict[str, int]:
+    return {"sec": ns // 1_000_000_000, "nanosec": ns % 1_000_000_000}
+
+
+def _xyz(x: np.ndarray) -> dict[str, float]:
+    return dict(zip("xyz", x.tolist(), strict=True))

@@ -1,0 +1,1 @@
+"""To look at: pictures, plots, the report, the live view."""

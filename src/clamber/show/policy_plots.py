@@ -1,0 +1,178 @@
+"""Pictures of a policy: its states and cycles, and how the pelvis is held."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch
+
+from clamber.contact.learn import dominant_actions, pelvis_samples
+from clamber.contact.policy import DemoPolicy, GeneralPolicy, PelvisDistribution
+from clamber.show.viz import save_plot
+
+COLOURS = {"G": "#bbf7d0", "M": "#fde68a", "O": "#bfdbfe", "goal": "#bbf7d0"}
+MEANING = {"G": "on the ground", "M": "on both", "O": "on the obstacle"}
+PER_ROW = 14  # states of the table in one row
+ANGLES = ("roll", "pitch", "yaw")
+
+
+def save_pictures(policy: GeneralPolicy, path: str | Path) -> list[Path]:
+    """Draw a policy beside its file: `<name>.png` and `<name>-pelvis.png`."""
+    path = Path(path)
+    return [
+        policy_plot(policy, path.with_suffix(".png")),
+        pelvis_plot(policy, path.with_name(f"{path.stem}-pelvis.png")),
+    ]
+
+
+def policy_plot(policy: GeneralPolicy, path: str | Path) -> Path:
+    """The options in order, and the states of the first demonstration behind them."""
+    demo = policy.demos[0] if policy.demos else None
+    rows = 0 if demo is None else math.ceil(len(demo.states) / PER_ROW)
+    fig = Figure(figsize=(13, 2.4 + 0.85 * rows), layout="constrained")
+    grid = fig.add_gridspec(2, 1, height_ratios=(2.2, max(0.85 * rows, 0.1)))
+    _draw_options(fig.add_subplot(grid[0]), policy)
+    if demo is not None:
+        _draw_table(fig.add_subplot(grid[1]), demo)
+    return save_plot(fig, path)
+
+
+def _draw_options(ax: Axes, policy: GeneralPolicy) -> None:
+    """A box for each option, with the arrow of its repetition."""
+    n = len(policy.options)
+    for k, option in enumerate(policy.options):
+        colour = COLOURS[option.region]
+        box = FancyBboxPatch(
+            (k, 0.0), 0.7, 0.6, boxstyle="round,pad=0.04", fc=colour, ec="0.3"
+        )
+        ax.add_patch(box)
+        place = "goal" if option.region == "goal" else f"$S_{option.region}$"
+        ax.text(k + 0.35, 0.48, f"{option.name}   {place}", ha="center", va="center")
+        half = math.ceil(len(option.surfaces) / 2)
+        lines = (option.surfaces[:half], option.surfaces[half:])
+        for row, line in enumerate(lines):
+            y = 0.27 - 0.17 * row
+            text = ", ".join(line)
+            ax.text(k + 0.35, y, text, ha="center", va="center", fontsize=8)
+        loop = FancyArrowPatch(
+            (k + 0.5, 0.66),
+            (k + 0.2, 0.66),
+            connectionstyle="arc3,rad=1.0",
+            arrowstyle="-|>",
+            mutation_scale=9,
+            color="0.3",
+        )
+        ax.add_patch(loop)
+        ax.text(k + 0.35, 0.87, f"{option.repeats} times", ha="center", fontsize=7)
+        if k + 1 < n:
+            _arrow(ax, (k + 0.75, 0.3), (k + 0.95, 0.3))
+    ax.set_xlim(-0.1, max(n, 6) - 0.15)
+    ax.set_ylim(-0.1, 1.0)
+    ax.set_axis_off()
+    ax.set_title("general policy: cycles of contacts by region", fontsize=9, loc="left")
+
+
+def _draw_table(ax: Axes, demo: DemoPolicy) -> None:
+    """States as numbered circles by region, row by row; arrows bear the actions."""
+    ruling = dominant_actions(demo)
+    for i, state in enumerate(demo.states):
+        x, y = float(i % PER_ROW), -0.8 * (i // PER_ROW)
+        ax.add_patch(Circle((x, y), 0.2, fc=COLOURS[state.region], ec="0.3", lw=0.8))
+        ax.text(x, y, str(i), ha="center", va="center", fontsize=7)
+        if i == len(demo.actions):
+            break
+        _arrow(ax, (x + 0.22, y), (x + 0.78, y))
+        action = demo.actions[i]
+        weak = i not in ruling
+        ax.text(
+            x + 0.5,
+            y + 0.1,
+            "gives up" if action is None else action,
+            ha="center",
+            fontsize=6.5,
+            color="0.55" if weak else "0.0",
+            style="italic" if weak else "normal",
+        )
+    rows = math.ceil(len(demo.states) / PER_ROW)
+    for k, (region, text) in enumerate(MEANING.items()):
+        x, y = 1.6 * k, -0.8 * rows
+        ax.add_patch(Circle((x, y), 0.12, fc=COLOURS[region], ec="0.3", lw=0.8))
+        ax.text(x + 0.2, y, text, va="center", fontsize=7.5)
+    ax.text(
+        1.6 * 3,
+        -0.8 * rows,
+        "grey: another surface of the limb bears the load",
+        va="center",
+        fontsize=7.5,
+        color="0.45",
+    )
+    ax.set_xlim(-0.4, PER_ROW - 0.1)
+    ax.set_ylim(-0.8 * rows - 0.3, 0.4)
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    title = f"demo policy: states and actions of {demo.source}"
+    ax.set_title(title, fontsize=9, loc="left")
+
+
+def _arrow(ax: Axes, a: tuple[float, float], b: tuple[float, float]) -> None:
+    ax.add_patch(
+        FancyArrowPatch(
+            a,
+            b,
+            arrowstyle="-|>",
+            mutation_scale=8,
+            color="0.3",
+            lw=0.8,
+            shrinkA=0,
+            shrinkB=0,
+        )
+    )
+
+
+def pelvis_plot(policy: GeneralPolicy, path: str | Path) -> Path:
+    """Normal distributions of roll, pitch and yaw near the edge and over the top."""
+    fig = Figure(figsize=(9, 5.2), layout="constrained")
+    axes = fig.subplots(3, 2, sharex=True)
+    samples = [pelvis_samples(d) for d in policy.demos]
+    columns = (
+        ("near the edge", policy.near_edge, 1),
+        ("over the top", policy.over_top, 0),
+    )
+    for column, (title, distribution, which) in enumerate(columns):
+        seen = np.concatenate([np.zeros((0, 3)), *(s[which] for s in samples)])
+        for k, name in enumerate(ANGLES):
+            _draw_angle(axes[k, column], distribution, k, seen[:, k])
+            axes[k, 0].set_ylabel(f"{name}: density", fontsize=8)
+        axes[0, column].set_title(
+            f"{title}, {distribution.samples} states", fontsize=9, loc="left"
+        )
+        axes[2, column].set_xlabel("angle [deg]", fontsize=8)
+    return save_plot(fig, path)
+
+
+def _draw_angle(ax: Axes, d: PelvisDistribution, k: int, seen: np.ndarray) -> None:
+    """One density [1/deg], what is imposed of it, and the samples."""
+    mean, sigma = math.degrees(d.mean[k]), math.degrees(d.sigma[k])
+    imposed = d.imposed[k]
+    ax.plot(np.degrees(seen), np.zeros(len(seen)), "|", color="0.5", ms=7)
+    label = "no samples"
+    if 0.0 < sigma < math.inf:
+        grid = np.linspace(-180.0, 180.0, 361)
+        near = mean + sigma * np.linspace(-5.0, 5.0, 201)
+        x = np.sort(np.concatenate([grid, near]))
+        y = np.exp(-0.5 * ((x - mean) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
+        ax.plot(x, y, color="#1d4ed8", lw=1.3, ls="-" if imposed else "--")
+        label = f"{round(mean)} $\\pm$ {sigma:.1f}"
+    if imposed is not None:
+        ax.axvspan(*np.degrees(imposed), color="#1d4ed8", alpha=0.15, lw=0)
+    text = f"{label} deg, {'imposed' if imposed else 'too wide to impose'}"
+    ax.text(0.02, 0.88, text, transform=ax.transAxes, fontsize=8, va="top")
+    ax.set_xlim(-180.0, 180.0)
+    ax.set_xticks(np.arange(-180, 181, 90))
+    ax.margins(y=0.25)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(labelsize=7)

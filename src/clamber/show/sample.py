@@ -1,0 +1,495 @@
+"""A run folder -> what there is to see of it: its records, and arrays over time.
+
+A run whose files are broken or missing is read as far as it can be, and what is not
+there is named. What is shown, in a report or a view, comes from here.
+
+Shapes: n samples, nq coordinates, nS surfaces, na joints, M recorded states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from clamber.contact.contact import Contact
+from clamber.errors import ClamberError, InputError
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.world import World
+from clamber.planning.records import Plan
+from clamber.planning.trajectory import Trajectory
+from clamber.run.folder import (
+    EXECUTION,
+    PLAN,
+    ROLLOUT,
+    RUN_MAKERS,
+    SCENE,
+    TIMINGS,
+    TRAJECTORY,
+    VERDICT,
+    load_fields,
+    load_plan,
+    load_rollout,
+)
+from clamber.show.viz import (
+    describe_move,
+    loaded_surfaces,
+    near_edge_points,
+    robot_corners,
+    runs_of,
+    stability_of,
+    support_below,
+)
+
+SAMPLES_A_SECOND = 25
+SAME_POSTURE = 1e-3  # [rad]
+SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
+_Loaded = TypeVar("_Loaded")
+
+
+# What a folder holds.
+
+
+@dataclass(eq=False, slots=True)
+class Reading:
+    """Reads what can be read of a folder and keeps why the rest could not."""
+
+    folder: Path
+    missing: list[str] = field(default_factory=list)
+
+    def attempt(self, load: Callable[[], _Loaded]) -> _Loaded | None:
+        """What `load` returns; None, and a sentence more, where it cannot."""
+        try:
+            return load()
+        except ClamberError as e:
+            text = str(e).replace(f"{self.folder}/", "")
+            if text not in self.missing:
+                self.missing.append(text)
+            return None
+
+    def fields(self, name: str) -> dict[str, Any]:
+        """The fields of a JSON file; none where it cannot be read."""
+        return self.attempt(lambda: load_fields(self.folder, name)) or {}
+
+    def has(self, name: str) -> bool:
+        """Whether there is such a file."""
+        return (self.folder / name).exists()
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Run:
+    """What could be read of a run folder.
+
+    Attributes:
+        written, execution, verdict, timings: Fields of the JSON files; empty where they
+            are missing.
+        plan, rollout: None where their files are.
+        ran: There is a rollout, whole or not.
+        missing: A sentence for each thing that could not be read.
+    """
+
+    folder: Path
+    written: Mapping[str, Any]
+    plan: Plan | None
+    rollout: Rollout | None
+    execution: Mapping[str, Any]
+    verdict: Mapping[str, Any]
+    timings: Mapping[str, Any]
+    ran: bool
+    missing: list[str]
+
+
+def read_run(folder: Path) -> Run:
+    """Read all that can be read of a run folder.
+
+    Raises:
+        InputError: It is no folder.
+    """
+    if not folder.is_dir():
+        raise InputError(f"a run folder; {RUN_MAKERS}", source=folder)
+    reading = Reading(folder)
+    written = reading.fields(PLAN)
+    ran = reading.has(ROLLOUT)
+    plan, rollout = None, None
+    if written:
+        plan = reading.attempt(lambda: load_plan(folder, without=(TIMINGS,)))
+        if plan is None and reading.has(SCENE):
+            plan = reading.attempt(
+                lambda: load_plan(folder, without=(TIMINGS, TRAJECTORY))
+            )
+        if ran:
+            rollout = reading.attempt(lambda: load_rollout(folder))
+            if rollout is None and plan is not None:
+                rollout = reading.attempt(
+                    lambda: load_rollout(folder, with_events=False)
+                )
+    elif ran:
+        reading.missing.append(f"{ROLLOUT} is not shown: that takes a whole {PLAN}")
+    execution = reading.fields(EXECUTION) if ran or reading.has(EXECUTION) else {}
+    verdict = reading.fields(VERDICT) if ran or reading.has(VERDICT) else {}
+    timings = reading.fields(TIMINGS)
+    if written and not ran:
+        if verdict or execution:
+            text = "it has been run in physics; `clamber simulate` writes it anew"
+        else:
+            text = "the plan has not been run in physics"
+        reading.missing.append(f"no {ROLLOUT}: {text}")
+    return Run(
+        folder=folder,
+        written=written,
+        plan=plan,
+        rollout=rollout,
+        execution=execution,
+        verdict=verdict,
+        timings=timings,
+        ran=ran,
+        missing=reading.missing,
+    )
+
+
+# Stances.
+
+
+def stance_rows(
+    written: Mapping[str, Any], times: list[float | None]
+) -> list[dict[str, Any]]:
+    """Rows of the table of stances, by the keys of `plan.json`.
+
+    Args:
+        written: Fields of `plan.json`, or none.
+        times: When each keyframe is reached [s].
+    """
+    rows, before = [], None
+    for key, time in zip(written.get("keyframes", []), times, strict=True):
+        stance = [
+            Contact(
+                surface=c["surface"],
+                support=c["support"],
+                position=np.array(c["position"]),
+                quaternion=np.array(c["quaternion"]),
+            )
+            for c in key["contacts"]
+        ]
+        on = ", ".join(c.surface for c in stance)
+        move = f"start, on {on}" if before is None else describe_move(before, stance)
+        before = stance
+        e = key["static_equilibrium"]
+        force = _force_by_surface(e)
+        rows.append(
+            {
+                "move": move,
+                "time": time,
+                "com_margin": key["com_margin"],
+                "margin": e["margin"],
+                "limiting": e["limiting"],
+                "contacts": [
+                    {
+                        "surface": c["surface"],
+                        "support": c["support"],
+                        "position": c["position"],
+                        "projected_distance": c["projected_distance"],
+                        "contact_angle": c["contact_angle"],
+                        "phase": c["phase"],
+                        "force": force.get(c["surface"]),
+                    }
+                    for c in key["contacts"]
+                ],
+            }
+        )
+    return rows
+
+
+def _force_by_surface(equilibrium: Mapping[str, Any]) -> dict[str, list[float]]:
+    """[N] of each surface over its bearing points; empty where they are not named."""
+    names, forces = equilibrium.get("surfaces"), equilibrium["forces"]
+    if not isinstance(names, list) or len(names) != len(forces):
+        return {}
+    total: dict[str, np.ndarray] = {}
+    for name, force in zip(names, forces, strict=True):
+        total[str(name)] = total.get(str(name), np.zeros(3)) + np.array(force)
+    return {n: f.tolist() for n, f in total.items()}
+
+
+def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
+    """When each keyframe is reached [s]; None where the run never gets there.
+
+    A plan that was adapted has times of its own: there a keyframe is looked for among
+    the spells with its contacts, each after the one before, and is where the reference
+    is nearest to its posture, for the last time.
+    """
+    if plan.trajectory is None:
+        if rollout is None:  # the keyframes alone, a second each
+            return [float(i) for i in range(len(plan.keyframes))]
+        return [None] * len(plan.keyframes)
+    followed = None if rollout is None else rollout.followed
+    end = math.inf if rollout is None else float(rollout.time[-1]) + 0.02
+    if followed is None:
+        known = [float(t) for t in plan.trajectory.keyframes]
+        known += [math.inf] * (len(plan.keyframes) - len(known))
+        return [t if t <= end else None for t in known[: len(plan.keyframes)]]
+    changes = np.flatnonzero(np.any(np.diff(followed.contact, axis=0), axis=1)) + 1
+    spells = list(pairwise([0, *changes.tolist(), len(followed.time)]))
+    times: list[float | None] = []
+    first = 0
+    joints = plan.world.qadr
+    for key in plan.keyframes:
+        wanted = {c.surface for c in key.stance}
+        found = None
+        for k in range(first, len(spells)):
+            a, b = spells[k]
+            row = followed.contact[a]
+            now = {s for s, x in zip(followed.surfaces, row, strict=True) if x}
+            if now == wanted and followed.time[a] <= end:
+                gap = np.abs(followed.q[a:b, joints] - key.q[joints]).max(axis=1)
+                near = np.flatnonzero(gap <= gap.min() + SAME_POSTURE)
+                last = near[-1] if times else 0  # the run begins with the first one
+                found, first = min(float(followed.time[a + last]), end), k + 1
+                break
+        times.append(found)
+    return times
+
+
+# The motion, sampled.
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Motion:
+    """A run over time: what physics made of it, else its plan, else its keyframes.
+
+    Attributes:
+        world: That it moves in.
+        stills: Keyframes alone, one a second.
+        time: (n,) [s]; q: (n, nq); reference: (n, nq) what was to be followed, where
+            physics ran.
+        points: (n, nS, 3) lowest points of the surfaces [m]; support: (n, nS) index of
+            the support below, in the order of `world.supports`.
+        planned: (n, nS) bool, contacts of the reference; loaded: what bears in physics.
+        ratio: (n, nS) projected distance over its limit, of what is planned or bears.
+        margin: (n,) of the centre of mass [m]; planned_margin: of the reference.
+        error: (n, 3) largest and root mean square joint error [rad], of the base [m].
+        force: (n, nS, 3) [N] in the world.
+        size: (n, nS) [N], effort: (n, na) share of the limit, push_size: (n, 1) [N]:
+            the largest from a sample to the next, effort with its sign.
+        push: (n, 3) on the pelvis [N].
+        schedule, loads: For each surface from when to when it is planned to bear, and
+            bears [s].
+        events: Times at which a contact is made or ends [s]; felt: at which something
+            was felt.
+
+    An array is None where there is nothing that it could be of.
+    """
+
+    world: World
+    stills: bool
+    time: np.ndarray
+    q: np.ndarray
+    reference: np.ndarray | None = None
+    points: np.ndarray
+    support: np.ndarray
+    planned: np.ndarray | None
+    loaded: np.ndarray | None = None
+    ratio: np.ndarray
+    margin: np.ndarray
+    planned_margin: np.ndarray | None = None
+    error: np.ndarray | None = None
+    force: np.ndarray | None = None
+    size: np.ndarray | None = None
+    effort: np.ndarray | None = None
+    push: np.ndarray | None = None
+    push_size: np.ndarray | None = None
+    schedule: list[list[tuple[float, float]]]
+    loads: list[list[tuple[float, float]]] | None
+    events: list[float]
+    felt: list[float]
+
+
+def sample_motion(
+    plan: Plan,
+    rollout: Rollout | None,
+    execution: Mapping[str, Any],
+    most: int | None = None,
+) -> Motion:
+    """Sample a run at 25 Hz.
+
+    Args:
+        plan: What was to be done.
+        rollout: What physics made of it, or None.
+        execution: Fields of `execution.json`, or none.
+        most: Samples at most.
+    """
+    world = plan.world if rollout is None else rollout.world
+    reference = plan.trajectory
+    if rollout is not None:
+        reference = rollout.followed or reference
+    series: dict[str, Any]
+    loads = None
+    if rollout is not None:
+        rows = even_rows(rollout.time, most)
+        time, q = rollout.time[rows], rollout.qpos[rows]
+        loaded = steadily_loaded(rollout)
+        loads = spells(rollout.time, loaded)
+        series = _physics(rollout, reference, loaded, rows)
+    elif reference is not None:
+        rows = even_rows(reference.time, most)
+        time, q = reference.time[rows], reference.q[rows]
+        series = {"planned": reference.contact[rows]}
+    else:
+        time = np.arange(len(plan.keyframes), dtype=float)
+        q = np.array([k.q for k in plan.keyframes])
+        held = [{c.surface for c in k.stance} for k in plan.keyframes]
+        series = {"planned": np.array([[s in h for s in world.surfaces] for h in held])}
+    kin = Kinematics(world)
+    points, support = surface_points(world, kin, q)
+    planned, bears = series["planned"], series.get("loaded")
+    bears = planned if bears is None else bears
+    marked = bears if planned is None else bears | planned
+    names = tuple(world.surfaces)
+    d, limit, margin = stability_of(world, q, marked, names)
+    other = np.any(marked != bears, axis=1)  # what bears nothing holds no CoM
+    margin[other] = stability_of(world, q[other], bears[other], names)[2]
+    q_ref = series.get("reference")
+    if q_ref is not None and planned is not None:
+        series["planned_margin"] = stability_of(world, q_ref, planned, names)[2]
+        series["error"] = _errors(world, q, q_ref)
+    end = float(time[-1])
+    schedule = [] if reference is None else spells(reference.time, reference.contact)
+    schedule = [[(a, min(b, end)) for a, b in x if a < end] for x in schedule]
+    switches = {t for x in loads or schedule for pair in x for t in pair}
+    return Motion(
+        world=world,
+        stills=rollout is None and reference is None,
+        time=time,
+        q=q,
+        points=points,
+        support=support,
+        ratio=d / limit,
+        margin=margin,
+        schedule=schedule or [[] for _ in world.surfaces],
+        loads=loads,
+        events=sorted({round(t, 3) for t in switches if SHORTEST_LOAD < t < end}),
+        felt=[e["time"] for e in execution.get("events", []) if e["time"] <= end],
+        **series,
+    )
+
+
+def even_rows(time: np.ndarray, most: int | None) -> np.ndarray:
+    """Indices of samples at 25 Hz, evenly spaced, the last one among them.
+
+    Args:
+        time: (n,) evenly spaced [s].
+        most: So many at most.
+    """
+    duration = float(time[-1] - time[0])
+    gaps = max(1, round(duration * SAMPLES_A_SECOND))
+    if most is not None:
+        gaps = min(most - 1, gaps)
+    step = max(1, math.ceil((len(time) - 1) / gaps))
+    return np.unique(np.append(np.arange(0, len(time), step), len(time) - 1))
+
+
+def _physics(
+    rollout: Rollout,
+    reference: Trajectory | None,
+    loaded: np.ndarray,
+    rows: np.ndarray,
+) -> dict[str, np.ndarray | None]:
+    """Series of what physics made; torques and forces at their peaks."""
+    world = rollout.world
+    order = [world.model.actuator(name).id for name in world.joints]
+    effort = rollout.actuator_force[:, order] / world.tau_max
+    size = np.linalg.norm(rollout.contact_force, axis=2)
+    out: dict[str, np.ndarray | None] = {
+        "loaded": loaded[rows],
+        "force": rollout.contact_force[rows],
+        "size": peaks(size, rows),
+        "effort": peaks(effort, rows),
+        "planned": None,
+    }
+    if reference is not None:
+        at = np.minimum(rows * rollout.stride, len(reference.time) - 1)
+        out["planned"] = reference.contact[at]
+        out["reference"] = reference.q[at]
+    if rollout.push is not None:
+        at = np.minimum(rows * rollout.stride, len(rollout.push) - 1)
+        size = np.linalg.norm(rollout.push, axis=1)[:, None]
+        out["push"], out["push_size"] = rollout.push[at], peaks(size, at)
+    return out
+
+
+def peaks(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(n, k) of x (M, k), from each row up to the next: the value farthest from 0."""
+    high = np.maximum.reduceat(x, rows, axis=0)
+    low = np.minimum.reduceat(x, rows, axis=0)
+    return np.where(high >= -low, high, low)
+
+
+def surface_points(
+    world: World, kin: Kinematics, q: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest points (n, nS, 3) [m] of the surfaces, index (n, nS) of supports below."""
+    names = list(world.supports)
+    points = np.zeros((len(q), len(world.surfaces), 3))
+    support = np.zeros((len(q), len(world.surfaces)), dtype=int)
+    for i, posture in enumerate(q):
+        kin.update(posture)
+        for j, surface in enumerate(world.surfaces):
+            below = support_below(world, kin, surface)
+            points[i, j] = kin.contact_point(surface, below.normal)
+            support[i, j] = names.index(below.name)
+    return points, support
+
+
+def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> np.ndarray:
+    """(n, 3) largest and mean square joint error [rad], distance of the base [m]."""
+    off = np.abs(q[:, world.qadr] - q_ref[:, world.qadr])
+    base = np.linalg.norm(q[:, :3] - q_ref[:, :3], axis=1)
+    rms = np.sqrt((off**2).mean(axis=1))
+    return np.stack([off.max(axis=1), rms, base], axis=1)
+
+
+def steadily_loaded(rollout: Rollout) -> np.ndarray:
+    """(M, nS) bool, the surfaces that bear; gaps, then touches, below 60 ms left out.
+
+    A stiff contact that rolls is without force for a step now and then; one in which
+    the run begins, until it has been pressed.
+    """
+    loaded = loaded_surfaces(rollout.world, rollout)
+    last = len(rollout.time) - 1
+    step = float(rollout.time[-1] - rollout.time[0]) / max(last, 1)
+    for column in loaded.T:
+        for state in (True, False):
+            for a, b in runs_of(column != state):
+                if (a > 0 or state) and b <= last and (b - a) * step < SHORTEST_LOAD:
+                    column[a:b] = state
+    return loaded
+
+
+def spells(time: np.ndarray, contact: np.ndarray) -> list[list[tuple[float, float]]]:
+    """For each surface (columns) from when to when it is in contact [s]."""
+    last = len(time) - 1
+    return [
+        [(float(time[a]), float(time[min(b, last)])) for a, b in runs_of(column)]
+        for column in contact.T
+    ]
+
+
+def seen_points(kin: Kinematics, q: np.ndarray) -> np.ndarray:
+    """(m, 3) points that a camera has to have in view [m].
+
+    They are the corners of boxes around some of the postures (n, nq), and the near
+    edge.
+    """
+    corners = []
+    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    for posture in q[np.unique(np.linspace(0, len(q) - 1, 40).astype(int))]:
+        kin.update(posture)
+        points = robot_corners(kin)
+        low, high = points.min(axis=0), points.max(axis=0)
+        corners.append(low + sides * (high - low))
+    return np.concatenate([*corners, near_edge_points(kin.world.scene)]).round(3)

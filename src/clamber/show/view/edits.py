@@ -1,0 +1,211 @@
+"""A contact sequence as a person changes it: contacts moved, surfaces left out.
+
+Edits are made to the sequence of a plan, which is in the robot's scene and at its
+scale; planning it again is `pipeline.plan`, as ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from clamber.contact.contact import Contact, ContactSequence
+from clamber.contact.steps import Step, same_place, split_moves
+from clamber.execution.simulation import Rollout, Verdict
+from clamber.model.scene import Support
+from clamber.planning.planner import plan
+from clamber.planning.records import Plan
+from clamber.planning.substitutes import without_surfaces
+from clamber.run.folder import (
+    SEQUENCE,
+    next_free_folder,
+    save_plan,
+    save_rollout,
+    save_sequence,
+    save_verdict,
+)
+
+INSET = 0.01  # [m] a contact that is dragged stays so far inside its support
+FOLDER = "edited"  # in the run folder
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Spell:
+    """A contact over the stances of a sequence that hold it.
+
+    Attributes:
+        contact: As the sequence has it.
+        first, last: Its first stance, and the one after its last.
+        planned: (3,) where the plan makes it [m], which optimises what it is shown.
+    """
+
+    contact: Contact
+    first: int
+    last: int
+    planned: np.ndarray
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.contact.surface} on {self.contact.support}, stance {self.first}"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Edits:
+    """What a person wants otherwise.
+
+    Attributes:
+        moved: Place (3,) of contacts by the index of their spell [m].
+        off: Surfaces that are not to be used.
+    """
+
+    moved: Mapping[int, np.ndarray] = field(
+        default_factory=lambda: MappingProxyType({})
+    )
+    off: frozenset[str] = frozenset()
+
+    def __bool__(self) -> bool:
+        """Whether there is any."""
+        return bool(self.moved or self.off)
+
+
+def spells_of(made: Plan) -> tuple[Spell, ...]:
+    """The contacts of a plan's sequence that can be moved: those made on the way."""
+    sequence = made.sequence
+    planned = {
+        (step.stance, step.move.makes.surface): made.keyframes[i]
+        for i, step in keyframe_steps(made)
+        if step.move.makes is not None
+    }
+    out = []
+    for surface in made.world.surfaces:
+        column = [s.contact(surface) for s in sequence.stances]
+        i = 0
+        while i < len(column):
+            c, j = column[i], i + 1
+            if c is None:
+                i += 1
+                continue
+            while j < len(column) and (d := column[j]) and same_place(c, d):
+                j += 1
+            if i > 0:
+                key = planned.get((i, surface))
+                at = [x for x in key.stance if x.surface == surface] if key else []
+                out.append(
+                    Spell(
+                        contact=c,
+                        first=i,
+                        last=j,
+                        planned=at[0].position if at else c.position,
+                    )
+                )
+            i = j
+    return tuple(sorted(out, key=lambda s: s.first))
+
+
+def keyframe_steps(made: Plan) -> list[tuple[int, Step]]:
+    """Index of each keyframe that a step of the sequence leads to, and that step."""
+    steps = split_moves(made.sequence, made.world)[0]
+    out, k = [], 0
+    for i in range(1, len(made.keyframes)):
+        before = {c.surface for c in made.keyframes[i - 1].stance}
+        new = [c.surface for c in made.keyframes[i].stance if c.surface not in before]
+        for j in range(k, len(steps)):
+            makes = steps[j].move.makes
+            if (None if makes is None else makes.surface) in (new or [None]):
+                out.append((i, steps[j]))
+                k = j + 1
+                break
+    return out
+
+
+def clamped(support: Support, point: np.ndarray) -> np.ndarray:
+    """(3,) the point of a support, a little inside its border, that is nearest.
+
+    Args:
+        support: Convex.
+        point: (3,) in the world [m].
+    """
+    local = support.rotation.T @ (point - support.position)
+    vertices = support.polygon
+    inner = vertices * np.maximum(
+        1.0 - INSET / np.maximum(np.linalg.norm(vertices, axis=1, keepdims=True), 1e-9),
+        0.0,
+    )
+    p = local[:2]
+    edges = np.roll(inner, -1, axis=0) - inner
+    across = edges[:, 0] * (p[1] - inner[:, 1]) - edges[:, 1] * (p[0] - inner[:, 0])
+    if np.any(across < 0):  # counter-clockwise: to the right of an edge is outside
+        share = np.sum((p - inner) * edges, axis=1) / np.sum(edges**2, axis=1)
+        near = inner + np.clip(share, 0.0, 1.0)[:, None] * edges
+        p = near[np.argmin(np.linalg.norm(near - p, axis=1))]
+    return support.position + support.rotation[:, :2] @ p
+
+
+def edited_sequence(made: Plan, edits: Edits) -> ContactSequence:
+    """The sequence of a plan with the edits in it.
+
+    Raises:
+        KeyError: A spell is none of the plan's.
+    """
+    spells = dict(enumerate(spells_of(made)))
+    stances = list(made.sequence.stances)
+    for index, place in edits.moved.items():
+        spell = spells[index]
+        support = made.world.supports[spell.contact.support]
+        contact = replace(spell.contact, position=clamped(support, place), firm=True)
+        for i in range(spell.first, spell.last):
+            stances[i] = replace(
+                stances[i],
+                contacts=tuple(
+                    contact if c.surface == contact.surface else c
+                    for c in stances[i].contacts
+                ),
+            )
+    sequence = replace(made.sequence, stances=tuple(stances))
+    return without_surfaces(sequence, edits.off)
+
+
+def plan_edited(
+    made: Plan,
+    edits: Edits,
+    progress: Callable[[str, float, str], None] | None = None,
+) -> Plan:
+    """Plan again, with the edits.
+
+    Raises:
+        InputError: The scene does not fit what is left of the sequence.
+    """
+    return plan(
+        edited_sequence(made, edits),
+        made.world.robot,
+        made.world.scene,
+        options=made.options,
+        progress=progress,
+    )
+
+
+def save_edited(
+    folder: Path, made: Plan, done: tuple[Rollout, Verdict] | None = None
+) -> Path:
+    """Save a plan, and what physics made of it, as a run of its own.
+
+    Args:
+        folder: The run folder: `edited` in it, or `edited-2` ... where that exists.
+        made: The plan.
+        done: Rollout and verdict, where it has been simulated.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    out = next_free_folder(folder, FOLDER)
+    save_sequence(made.sequence, out / SEQUENCE)
+    save_plan(made, out)
+    if done is not None:
+        save_rollout(made, done[0], out)
+        save_verdict(done[1], out)
+    return out

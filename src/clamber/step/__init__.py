@@ -1,0 +1,1 @@
+"""One contact change: statics, postures, transition, path."""

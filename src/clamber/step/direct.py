@@ -1,0 +1,55 @@
+"""Joints and contact positions in one constrained problem.
+
+The contact positions need no variables of their own: on its support, a contact is where
+the posture puts the surface, so L_s, the bounds of the support and the closure of all
+contacts are functions of q, and one sequence of QPs solves for all of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clamber.step.ik import IK, ContactGoal, support_rotation
+from clamber.step.posture import (
+    Keyframe,
+    KeyframeOptions,
+    KeyframeTask,
+    finish,
+    held_goal,
+    keyframe_problem,
+    stability_cost,
+)
+
+
+def optimise(
+    ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions
+) -> Keyframe:
+    """A stable posture for the stance, starting from `q` (nq,)."""
+    world = ik.world
+    ik.kin.update(q)
+    references = np.array([c.position for c in task.new]).reshape(-1, 3)
+    before, _ = stability_cost(ik.kin, task, references, options.stability_weight)
+    goals = tuple(
+        held_goal(world, c)
+        if task.fixed
+        else ContactGoal(
+            surface=c.surface,
+            support=c.support,
+            position=c.position,
+            rotation=support_rotation(world.supports[c.support], c.quaternion),
+            free=True,
+            stability=options.stability_weight,
+            reference=options.reference_weight,
+        )
+        for c in task.new
+    )
+    solution = ik.solve_hard(keyframe_problem(world, task, options, goals), q)
+    return finish(
+        ik,
+        task,
+        options,
+        solution.q,
+        method="direct",
+        iterations=solution.iterations,
+        cost_before=before,
+    )

@@ -1,0 +1,374 @@
+"""Neighbouring keyframes -> the postures that move one contact.
+
+A move makes, breaks or replaces the contact of one limb. Its transition first shifts
+the weight onto the contacts that stay, then closes the new contact, unloaded, in reach-
+to-support mode (4.26, 4.27), and ends in the next keyframe, loaded. The shift holds the
+centre of mass inside the ellipse of the remaining contacts (4.28).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from clamber.contact.contact import Contact
+from clamber.contact.steps import Guide, Move
+from clamber.errors import Status
+from clamber.model.world import World
+from clamber.step.ik import (
+    IK,
+    ContactGoal,
+    PostureProblem,
+    Residuals,
+    Solution,
+    base_clearance,
+    contact_clearance,
+    support_rotation,
+)
+from clamber.step.posture import CLEARANCE, Keyframe, held_goal, holds, weakness
+
+REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
+MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
+# that can be kept
+ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
+LEAN_WEIGHT = 0.5  # soft task (4.27)
+MOVED = 0.005  # [m] a contact that lies nearer to where it was has not moved
+APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Transition:
+    """The postures that move one contact.
+
+    Attributes:
+        move: With the contact where it is made.
+        before, after: Configurations (nq,) of the keyframes.
+        shifted: (nq,) all old contacts closed, weight on those that stay.
+        touching: (nq,) the new contact closed, not loaded.
+        stance: Contacts at its start.
+        held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
+        rolling: Contacts that are broken, as they are let go.
+        margin: Of the centre of mass to the border of its polygon, throughout [m].
+        status: Of the worst of its postures, with its residuals; OVERLOADED where the
+            contacts that stay and the joints cannot hold one of them.
+        note: Which joint cannot.
+    """
+
+    move: Move
+    before: np.ndarray
+    shifted: np.ndarray
+    touching: np.ndarray
+    after: np.ndarray
+    stance: tuple[Contact, ...]
+    held: tuple[Contact, ...]
+    rolling: tuple[Contact, ...]
+    margin: float
+    iterations: int
+    status: Status
+    residuals: Residuals
+    note: str = ""
+
+    @property
+    def leaving(self) -> tuple[Contact, ...]:
+        """Contacts that are broken, as they were."""
+        return tuple(c for c in self.stance if c.surface in self.move.breaks)
+
+
+def reach_to_support(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+    """(pitch, roll, yaw) of the moving link at its contact (4.26, 4.27) [rad].
+
+    Args:
+        p1: (3,) present contact point in the world.
+        p2: (3,) goal contact point in the world.
+        R_WB: (3, 3) the pelvis in the world.
+    """
+    p = p1 - p2
+    n = np.linalg.norm(p)
+    return REACH_ANGLE * (R_WB.T @ (p / n)) if n > 1e-9 else np.zeros(3)
+
+
+def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+    """(3,) unit vector from the new contact to the mass it will support.
+
+    The first two angles of (4.27) lean it from the vertical towards where the contact
+    comes from, so that the mass arrives behind its contact and moves over it as load
+    comes on.
+    """
+    pitch, roll, _ = reach_to_support(p1, p2, R_WB)
+    horizontal = R_WB @ np.array([pitch, roll, 0.0])
+    horizontal[2] = 0.0
+    angle = float(np.linalg.norm(horizontal))
+    horizontal *= np.sin(angle) / max(angle, 1e-9)
+    return horizontal + np.array(
+        [0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))]
+    )
+
+
+def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
+    """A flat contact on the edge that lies farthest `towards` (3,); others as they are.
+
+    A foot that is about to leave may lift its heel: what it gains in reach is what a
+    person gains on tiptoe.
+    """
+    edges = ik.world.edges[c.surface]
+    if not edges or c.edge is not None:
+        return c
+    ik.kin.update(q)
+    normal = ik.world.supports[c.support].normal
+    points = np.array(
+        [ik.kin.contact_point(c.surface, normal, i) for i in range(len(edges))]
+    )
+    i = int(np.argmax(points @ (towards - c.position)))
+    return replace(c, edge=i, position=points[i])
+
+
+def balance_problem(
+    world: World,
+    *,
+    held: tuple[Contact, ...],
+    closed: tuple[Contact, ...] = (),
+    q_reference: np.ndarray,
+    extra: tuple[ContactGoal, ...] = (),
+    posture_weight: float = 0.08,
+    touching: Mapping[str, str] | None = None,
+    margin: float = MARGINS[-1],
+) -> PostureProblem:
+    """Balance on `held`, with `closed` in contact but not loaded.
+
+    Args:
+        world: Robot and scene.
+        held: Contacts that bear load.
+        closed: Contacts that do not.
+        q_reference: (nq,) preferred posture.
+        extra: Further goals.
+        posture_weight: Of the preferred posture.
+        touching: Support by surface, of what may touch besides.
+        margin: Of the centre of mass to the border of its polygon [m].
+    """
+    where = {c.surface: c.support for c in (*held, *closed)} | dict(touching or {})
+    rolling = [c.surface for c in (*held, *closed) if c.edge is not None]
+    return PostureProblem(
+        goals=(
+            *(held_goal(world, c) for c in held),
+            *(held_goal(world, c, loaded=False) for c in closed),
+            *extra,
+        ),
+        q_reference=q_reference,
+        clearance=contact_clearance(
+            world, base_clearance(world, CLEARANCE), where, rolling
+        ),
+        balance_margin=margin,
+        posture_weight=posture_weight,
+        ellipse_weight=ELLIPSE_WEIGHT,
+        com_weight=0.3,
+        base_weight=0.0,
+    )
+
+
+def plan_transition(
+    ik: IK,
+    before: Keyframe,
+    after: Keyframe,
+    move: Move,
+    *,
+    margin: float,
+    guide: Guide | None = None,
+) -> Transition:
+    """Shift, touch and settle between two keyframes.
+
+    Args:
+        ik: Workspace.
+        before: Keyframe it starts from.
+        after: Keyframe it leads to.
+        move: What changes between them.
+        margin: Of the centre of mass to the border of its polygon [m].
+        guide: Where its postures may be found.
+    """
+    world, guide = ik.world, guide or Guide()
+    new = move.makes.surface if move.makes is not None else None
+    held = tuple(c for c in after.stance if c.surface != new)
+    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    middle = np.mean([c.position for c in held], axis=0)
+    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
+    shift = ik.solve_hard(
+        balance_problem(
+            world, held=held, closed=rolling, q_reference=before.q, margin=margin
+        ),
+        before.q,
+        hint=guide.shifted,
+    )
+    solutions, touching = [shift], after.q
+    if move.makes is not None:
+        made = next(c for c in after.stance if c.surface == move.makes.surface)
+        move = replace(move, makes=made)
+        if shift.status is Status.SOLVED:
+            touch = _touch(ik, held, made, shift.q, after.q, margin, guide.touching)
+            solutions.append(touch)
+            touching = touch.q
+    worst = max(solutions, key=lambda s: list(Status).index(s.status))
+    status, note = worst.status, ""
+    for s in solutions if status is Status.SOLVED else ():
+        ik.kin.update(s.q)
+        if not holds(ik.kin, held):
+            status, note = Status.OVERLOADED, weakness(ik.kin, held)
+    return Transition(
+        move=move,
+        before=before.q,
+        shifted=shift.q,
+        touching=touching,
+        after=after.q,
+        stance=before.stance,
+        held=held,
+        rolling=rolling,
+        margin=margin,
+        iterations=sum(s.iterations for s in solutions),
+        status=status,
+        note=note,
+        residuals=worst.residuals,
+    )
+
+
+def _touch(
+    ik: IK,
+    held: tuple[Contact, ...],
+    made: Contact,
+    shifted: np.ndarray,
+    after: np.ndarray,
+    margin: float,
+    hint: np.ndarray | None,
+) -> Solution:
+    """Close the new contact from the loaded posture, the weight still on the rest."""
+    world, kin = ik.world, ik.kin
+    kin.update(shifted)
+    support = world.supports[made.support]
+    p1 = kin.contact_point(made.surface, support.normal)
+    lean = lean_direction(p1, made.position, kin.rotation(world.base))
+    problem = balance_problem(
+        world,
+        held=held,
+        closed=(made,),
+        q_reference=0.5 * (shifted + after),
+        margin=margin,
+    )
+    problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
+    return ik.solve_hard(problem, after, hint=hint)
+
+
+def eased_contacts(
+    ik: IK,
+    before: Keyframe,
+    move: Move,
+    surfaces: Collection[str],
+    *,
+    margin: float = MARGINS[-1],
+) -> tuple[tuple[Contact, ...], Guide] | None:
+    """Where earlier contacts should have been for a move to work.
+
+    Solves the move's weight shift with these contacts free on their supports; where
+    that works as they are, the posture in which the new contact closes.
+
+    Args:
+        ik: Workspace.
+        before: Keyframe it starts from.
+        move: That does not work.
+        surfaces: Whose contacts are free.
+        margin: Of the centre of mass to the border of its polygon [m].
+
+    Returns:
+        The contacts at their better places, and the posture found with them; None where
+        that does not help either.
+    """
+    held = tuple(c for c in before.stance if c.surface not in {*move.breaks, *surfaces})
+    moved = tuple(c for c in before.stance if c.surface in surfaces)
+    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    middle = np.mean([c.position for c in (*held, *moved)], axis=0)
+    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
+    free = tuple(_free_goal(ik, c, 1.0) for c in moved)
+    touching = {c.surface: c.support for c in moved}
+    shift = balance_problem(
+        ik.world,
+        held=held,
+        closed=rolling,
+        q_reference=before.q,
+        extra=free,
+        touching=touching,
+        margin=margin,
+    )
+    problems = {"shifted": shift}
+    if move.makes is not None:
+        new, at = move.makes, move.makes.position
+        problems["touching"] = balance_problem(
+            ik.world,
+            held=tuple(rolled(ik, before.q, c, at) for c in held),
+            q_reference=before.q,
+            extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
+            touching=touching | {new.surface: new.support},
+            margin=margin,
+        )
+    for posture, problem in problems.items():
+        solution = ik.solve_hard(problem, before.q)
+        if solution.status is not Status.SOLVED:
+            return None
+        ik.kin.update(solution.q)
+        eased = tuple(_touching_at(ik, c) for c in moved)
+        if any(
+            np.linalg.norm(a.position - b.position) > MOVED
+            for a, b in zip(eased, moved, strict=True)
+        ):
+            return eased, Guide(**{posture: solution.q})
+    return None
+
+
+def _free_goal(
+    ik: IK, c: Contact, reference: float, *, loaded: bool = True
+) -> ContactGoal:
+    """Closed on its support, near where it is wanted."""
+    return ContactGoal(
+        surface=c.surface,
+        support=c.support,
+        position=c.position,
+        rotation=support_rotation(ik.world.supports[c.support], c.quaternion),
+        free=True,
+        loaded=loaded,
+        reference=reference,
+    )
+
+
+def _touching_at(ik: IK, c: Contact) -> Contact:
+    """The contact where its surface touches the support at the present posture.
+
+    It has not rolled: the posture in which it is made is yet to be found.
+    """
+    support = ik.world.supports[c.support]
+    p = ik.kin.contact_point(c.surface, support.normal)
+    return replace(c, position=support.project(p), link=None)
+
+
+def approach_contact(
+    ik: IK,
+    held: tuple[Contact, ...],
+    wanted: Contact,
+    q: np.ndarray,
+    hint: np.ndarray | None = None,
+) -> tuple[Contact, Solution]:
+    """The nearest contact to `wanted` that closes while the others bear the weight.
+
+    Args:
+        ik: Workspace.
+        held: Contacts that stay.
+        wanted: Where the contact would be liked.
+        q: (nq,) to start from.
+        hint: (nq,) a posture in which a similar contact closes.
+    """
+    problem = balance_problem(
+        ik.world,
+        held=held,
+        q_reference=q,
+        extra=(_free_goal(ik, wanted, APPROACH_WEIGHT, loaded=False),),
+        touching={wanted.surface: wanted.support},
+    )
+    solution = ik.solve_hard(problem, q, hint=hint)
+    ik.kin.update(solution.q)
+    return _touching_at(ik, wanted), solution

@@ -1,0 +1,1 @@
+"""Many runs: climbs, sweeps, statistics."""

@@ -1,0 +1,215 @@
+"""job -> outcome: one whole climb, from the recording to the verdict of physics.
+
+A job is the flags of `clamber climb`, by the same names, and nothing else: whatever a
+job did can be done again from the command line.
+"""
+
+from __future__ import annotations
+
+import functools
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+
+from clamber.errors import InputError
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.servo import ControlMode
+from clamber.execution.simulation import DEFAULT_CONTROLLER, judge, simulate
+from clamber.model.robot import load_robot
+from clamber.model.scene import Scene, input_error, load_scene
+from clamber.model.world import PHYSICS_STEP
+from clamber.planning.free import Bounds
+from clamber.planning.planner import plan
+from clamber.planning.records import Method, Plan, PlanOptions
+from clamber.planning.substitutes import plan_or_replan
+from clamber.recording.detect import detect_contacts
+from clamber.recording.library import load_demo
+
+EFFORT = "largest effort, share of the limit"  # a criterion of the verdict
+Contacts = Literal["any", "demonstrated"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """The flags of one climb.
+
+    Attributes:
+        demo: A recording, or a built-in demonstration.
+        robot: A built-in robot, or a robot.yaml.
+        height: Of the one box [m]; either this or `scene`.
+        scene: A scene.yaml.
+        method: How contact positions are optimised.
+        speed: Largest joint speed [rad/s], or `max`.
+        controller: `pid` or `mixed`.
+        contacts: `any`: others than the demonstrated ones where those have no stable
+            plan; or `demonstrated` only.
+        search: How far to search for other contacts.
+        disturb: What the planner does not know.
+    """
+
+    demo: str = "climb"
+    robot: str = "coman"
+    height: float | None = None
+    scene: str | None = None
+    method: Method = field(default_factory=lambda: PlanOptions().method)
+    speed: float | Literal["max"] = field(default_factory=lambda: PlanOptions().speed)
+    controller: ControlMode = DEFAULT_CONTROLLER
+    contacts: Contacts = "any"
+    search: Bounds = field(default_factory=Bounds)
+    disturb: Disturbance = field(default_factory=Disturbance)
+
+    def __post_init__(self) -> None:
+        """Check that there is one scene.
+
+        Raises:
+            InputError: Height and scene, or neither.
+        """
+        if (self.height is None) == (self.scene is None):
+            raise InputError("height or scene, one of them", field="height")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What became of a job.
+
+    Attributes:
+        reached: The verdict.
+        why: What failed first; empty where nothing did.
+        seconds: Of motion, until the end or the fall [s]; 0 where there was no plan.
+        replans: How often the rest was planned again on the way.
+        effort: Largest effort of any joint, share of its limit.
+    """
+
+    reached: bool
+    why: str = ""
+    seconds: float = 0.0
+    replans: int = 0
+    effort: float = 0.0
+
+
+_JOB: pydantic.TypeAdapter[Job] = pydantic.TypeAdapter(Job)
+GROUPS = {"search": Bounds, "disturb": Disturbance}  # flags such as `disturb.mass`
+FLAGS = tuple(f.name for f in fields(Job) if f.name not in GROUPS) + tuple(
+    f"{group}.{f.name}" for group, kind in GROUPS.items() for f in fields(kind)
+)
+
+
+def job_of(flags: Mapping[str, Any]) -> Job:
+    """The job of flags by name, such as `{"height": 0.275, "disturb.mass": 1.1}`.
+
+    Raises:
+        InputError: There is no such flag, or its value cannot be used.
+    """
+    for name in flags:
+        if name not in FLAGS:
+            raise InputError(f"one of {', '.join(FLAGS)}", field="flag", value=name)
+    tree: dict[str, Any] = {g: {} for g in GROUPS}
+    for name, value in flags.items():
+        group, _, own = name.rpartition(".")
+        (tree[group] if group else tree)[own] = value
+    try:
+        return _JOB.validate_python(tree)
+    except pydantic.ValidationError as e:
+        raise input_error(e, None) from e
+
+
+def command_of(job: Job) -> str:
+    """The line that does the job again: robot, scene, controller, and what differs."""
+    words = ["clamber", "climb"]
+    for name in FLAGS:
+        group, _, own = name.rpartition(".")
+        home = getattr(job, group) if group else job
+        value = getattr(home, own)
+        default = {
+            f.name: f.default_factory() if callable(f.default_factory) else f.default
+            for f in fields(home)
+        }[own]
+        if value is None or (value == default and name not in ("robot", "controller")):
+            continue
+        text = repr(value) if isinstance(value, float) else str(value)
+        # A number like -5e-05 would be taken for a flag.
+        words += [f"--{name}={text}"] if text.startswith("-") else [f"--{name}", text]
+    return shlex.join(words)
+
+
+def scene_of(height: float | None, path: str | Path | None) -> Scene:
+    """The scene of a file, or the one box of that height.
+
+    Raises:
+        InputError: The file or the height cannot be used.
+    """
+    if path is not None:
+        return load_scene(path)
+    assert height is not None
+    try:
+        return Scene.from_height(height)
+    except pydantic.ValidationError as e:
+        expected = input_error(e, None).expected
+        raise InputError(expected, source="--height", value=height) from e
+
+
+def run_job(job: Job) -> Outcome:
+    """Detect, plan, simulate, judge.
+
+    A scene out of the robot's reach and a plan that misses a step are outcomes: the
+    robot does not get there. An incomplete plan is not simulated.
+    """
+    try:
+        made = _planned(
+            job.demo,
+            job.robot,
+            job.height,
+            job.scene,
+            job.method,
+            job.speed,
+            job.contacts,
+            job.search,
+        )
+        if not made.complete or made.trajectory is None:
+            missed = [s.reason for s in made.skipped if s.missed]
+            reasons = missed or [s.reason for s in made.skipped] or ["no move in it"]
+            return Outcome(reached=False, why=f"no plan: {reasons[0]}")
+        rollout = simulate(made, controller=job.controller, disturbance=job.disturb)
+    except InputError as e:
+        return Outcome(reached=False, why=f"no plan: {e}")
+    verdict = judge(made, rollout)
+    wrong = [name for name, c in verdict.criteria.items() if not c.ok]
+    if rollout.fell:
+        wrong.insert(0, "fell")
+    elif rollout.stopped:
+        wrong.insert(0, f"stopped: {rollout.stopped}")
+    return Outcome(
+        reached=verdict.reached,
+        why="" if verdict.reached else wrong[0],
+        seconds=round(len(rollout.ctrl) * PHYSICS_STEP, 6),
+        replans=sum(e.text.startswith("planned again") for e in rollout.events),
+        effort=round(verdict.criteria[EFFORT].value, 6),
+    )
+
+
+@functools.lru_cache(maxsize=2)
+def _detected(demo: str) -> Any:
+    return detect_contacts(load_demo(demo))
+
+
+@functools.lru_cache(maxsize=4)
+def _planned(
+    demo: str,
+    robot: str,
+    height: float | None,
+    scene: str | None,
+    method: Method,
+    speed: float | Literal["max"],
+    contacts: Contacts,
+    search: Bounds,
+) -> Plan:
+    """One process does many jobs that differ in their disturbances alone."""
+    world = (_detected(demo), load_robot(robot), scene_of(height, scene))
+    options = PlanOptions(method=method, speed=speed)
+    if contacts == "demonstrated":
+        return plan(*world, options=options)
+    return plan_or_replan(*world, options=options, bounds=search)
