@@ -24,17 +24,17 @@ demo: $(VENV)/.has-video ## climb a box: plan, physics, pictures and video, into
 	@$(BIN)/clamber climb --video
 
 test: $(VENV)/.has-video $(VENV)/.has-test ## every test but the slow ones
-	$(BIN)/python -m pytest -m "not slow and not gpu and not network" -n $(WORKERS)
+	$(BIN)/python -m pytest -m "not slow and not gpu and not network" -n $(WORKERS) --dist loadfile
 
 test-all: $(VENV)/.has-video $(VENV)/.has-test ## the slow tests too: whole climbs in physics
-	$(BIN)/python -m pytest -m "not gpu and not network" -n $(WORKERS)
+	$(BIN)/python -m pytest -m "not gpu and not network" -n $(WORKERS) --dist loadfile
 
 test-mujoco3: | $(BIN)/python ## the tests of `make test` with the last MuJoCo 3, in an environment of their own
 	@[ -x $(VENV3)/bin/python ] || $(BIN)/python -m venv $(VENV3)
 	@grep -v '^mujoco' constraints.txt > $(VENV3)/constraints.txt
 	@$(VENV3)/bin/python -m pip install --quiet --disable-pip-version-check \
 		-c $(VENV3)/constraints.txt 'mujoco<4' -e '.[video,test]'
-	$(VENV3)/bin/python -m pytest -m "not slow and not gpu and not network and not compare" -n $(WORKERS)
+	$(VENV3)/bin/python -m pytest -m "not slow and not gpu and not network and not compare" -n $(WORKERS) --dist loadfile
 
 fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then what failed last, stops at the first failure
 	@$(BIN)/ruff check --quiet .
@@ -58,7 +58,7 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	$(BIN)/clamber learn crossing --out build/policy/policy.json
 	cp build/policy/policy.png docs/policy.png
 	cp build/policy/policy-pelvis.png docs/policy-pelvis.png
-	$(BIN)/python -c 'from clamber.viz import cost_shapes; cost_shapes("docs/cost-shapes.png")'
+	$(BIN)/python -c 'from clamber.show.viz import cost_shapes; cost_shapes("docs/cost-shapes.png")'
 	$(BIN)/python docs/tools/pictures.py docs/stages
 
 experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)

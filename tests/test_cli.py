@@ -714,7 +714,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch, stages: SimpleNamespace) -> list[tupl
             asked.append((name, args, options))
             return Path("there.png")
 
-        monkeypatch.setattr(f"clamber.viz.{name}", draw)
+        monkeypatch.setattr(f"clamber.show.viz.{name}", draw)
 
     for name in ("render_frame", "keyframe_sheet", "video"):
         note(name)

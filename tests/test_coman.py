@@ -12,7 +12,7 @@ import yaml
 
 import clamber
 
-FOLDER = Path(clamber.__file__).parent / "robots" / "coman"
+FOLDER = Path(clamber.__file__).parent / "model" / "robots" / "coman"
 SURFACES = ("LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee", "LFoot", "RFoot")
 SIDES = (("L", 1.0), ("R", -1.0))
 

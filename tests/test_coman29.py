@@ -32,7 +32,7 @@ from test_coman import (
     volume,
 )
 
-ROBOTS = Path(clamber.__file__).parent / "robots"
+ROBOTS = Path(clamber.__file__).parent / "model" / "robots"
 FOLDER = ROBOTS / "coman29"
 
 # joint: axis, lower, upper [rad].

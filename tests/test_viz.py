@@ -391,7 +391,7 @@ def test_the_weighted_norm_is_five_times_the_norm(tmp_path: Path):
 
 
 def test_loading_the_module_changes_no_setting():
-    code = "import os, json; a = dict(os.environ); import clamber.viz; "
+    code = "import os, json; a = dict(os.environ); import clamber.show.viz; "
     code += "print(json.dumps({k: v for k, v in os.environ.items() if a.get(k) != v}))"
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
