@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber.model.records import short_repr
 from clamber.model.se3 import rotation_vector
 from clamber.model.world import World, chain_up
 
@@ -37,6 +38,8 @@ class Balls:
     normals: np.ndarray
     links: np.ndarray
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proximity:
@@ -54,6 +57,8 @@ class Proximity:
     normal: np.ndarray
     first: np.ndarray
     second: np.ndarray
+
+    __repr__ = short_repr
 
 
 def _nearer_than(near: Proximity, reach: float) -> Proximity:

@@ -17,6 +17,7 @@ import pydantic
 
 from clamber.errors import InputError
 from clamber.model.description import Description, compile_description, read_description
+from clamber.model.records import short_repr
 from clamber.model.scene import input_error, read_yaml
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -112,6 +113,8 @@ class Robot:
         default_factory=lambda: MappingProxyType({})
     )
     self_positioning: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     @property
     def surfaces(self) -> tuple[str, ...]:

@@ -15,9 +15,9 @@ from typing import Annotated
 import numpy as np
 import pydantic
 import yaml
-from numpy.typing import ArrayLike
 
 from clamber.errors import InputError, unreadable
+from clamber.model.records import frozen_array, short_repr
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.terrain import NAME, read_drawn_boxes
 
@@ -26,16 +26,6 @@ DRAWN = (".obj", ".xml")  # files of boxes
 GROUND_HALF_SIZE = 20.0  # [m] the ground is a support of this half width
 NEAR_FACE = 0.23  # [m] from the ankles' midpoint to the box of `Scene.from_height`
 MAX_LENGTH = 50.0  # [m] a larger box is a wrong unit
-
-
-def _frozen(x: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    out = np.array(x, dtype=float)
-    if out.ndim != len(shape) or any(
-        s not in (-1, n) for s, n in zip(shape, out.shape, strict=True)
-    ):
-        raise ValueError(f"shape {out.shape}, expected {shape}")
-    out.setflags(write=False)
-    return out
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -59,12 +49,14 @@ class Support:
     normal: np.ndarray = field(init=False)
     _half_planes: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Copy the arrays and check that the polygon is convex, ccw."""
-        object.__setattr__(self, "position", _frozen(self.position, (3,)))
-        object.__setattr__(self, "rotation", _frozen(self.rotation, (3, 3)))
-        object.__setattr__(self, "normal", _frozen(self.rotation[:, 2], (3,)))
-        object.__setattr__(self, "polygon", _frozen(self.polygon, (-1, 2)))
+        object.__setattr__(self, "position", frozen_array(self.position, (3,)))
+        object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
+        object.__setattr__(self, "normal", frozen_array(self.rotation[:, 2], (3,)))
+        object.__setattr__(self, "polygon", frozen_array(self.polygon, (-1, 2)))
         edges = np.roll(self.polygon, -1, axis=0) - self.polygon
         nxt = np.roll(edges, -1, axis=0)
         if np.any(edges[:, 0] * nxt[:, 1] - edges[:, 1] * nxt[:, 0] <= 0):
@@ -73,7 +65,7 @@ class Support:
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         b = np.sum(out * self.polygon, axis=1)
         A = out @ self.rotation[:, :2].T
-        planes = _frozen(A, (-1, 3)), _frozen(b + A @ self.position, (-1,))
+        planes = frozen_array(A, (-1, 3)), frozen_array(b + A @ self.position, (-1,))
         object.__setattr__(self, "_half_planes", planes)
 
     def height(self, points: np.ndarray) -> np.ndarray:
@@ -109,11 +101,13 @@ class Box:
     friction: float = 0.8
     roughness: float = 0.0
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""
-        object.__setattr__(self, "size", _frozen(self.size, (3,)))
-        object.__setattr__(self, "position", _frozen(self.position, (3,)))
-        object.__setattr__(self, "rotation", _frozen(self.rotation, (3, 3)))
+        object.__setattr__(self, "size", frozen_array(self.size, (3,)))
+        object.__setattr__(self, "position", frozen_array(self.position, (3,)))
+        object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
 
     @property
     def top(self) -> Support:
@@ -155,11 +149,13 @@ class Scene:
     start: np.ndarray
     goal: np.ndarray | None = None
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Copy the arrays and check that names are unique."""
-        object.__setattr__(self, "start", _frozen(self.start, (3,)))
+        object.__setattr__(self, "start", frozen_array(self.start, (3,)))
         if self.goal is not None:
-            object.__setattr__(self, "goal", _frozen(self.goal, (-1,)))
+            object.__setattr__(self, "goal", frozen_array(self.goal, (-1,)))
         names = [b.name for b in self.boxes]
         if len({*names, GROUND}) != len(names) + 1:
             raise ValueError(f"names are not unique: {names}")

@@ -19,6 +19,7 @@ import numpy as np
 
 from clamber.errors import InputError
 from clamber.model.description import read_description
+from clamber.model.records import short_repr
 from clamber.model.robot import Robot, has_prefix, world_name
 from clamber.model.scene import GROUND, Scene, Support
 from clamber.model.se3 import matrix_from_quat
@@ -54,6 +55,8 @@ class Surface:
     radius: float
     rotation: np.ndarray | None
     corners: np.ndarray
+
+    __repr__ = short_repr
 
     @property
     def is_flat(self) -> bool:
@@ -109,6 +112,8 @@ class World:
     touching: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
     base: int
     mass: float
+
+    __repr__ = short_repr
 
     def surface(self, name: str, edge: int | None = None) -> Surface:
         """A surface, or one edge of it where it has rolled onto that."""
