@@ -29,7 +29,7 @@ def table(result: Plan) -> None:
     print(f"  {'keyframe':34}{'iterations':>11}{'before':>9}{'after':>9}  status")
     for key, path in zip(result.keyframes[1:], result.paths, strict=True):
         print(
-            f"  {path.transition.move!s:34}{key.iterations:11d}"
+            f"  {path.transition.step!s:34}{key.iterations:11d}"
             f"{key.cost_before:9.4f}{key.cost_after:9.4f}  {key.status.name.lower()}"
         )
     for s in result.skipped:

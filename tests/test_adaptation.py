@@ -443,35 +443,35 @@ def test_each_limb_leaves_the_surface_that_it_is_on(demo_plan):
         replace(c, surface="LElbow") if c.surface == "LHand" else c for c in key.stance
     )
     new = from_here(steps[2:], other, world)
-    assert [s.move.breaks for s in steps[2:]] == [
+    assert [s.breaks for s in steps[2:]] == [
         ("LHand",),
         ("RHand",),
         ("LFoot",),
         ("RFoot",),
     ]
-    assert [s.move.breaks for s in new] == [
+    assert [s.breaks for s in new] == [
         ("LElbow",),
         ("RHand",),
         ("LFoot",),
         ("RFoot",),
     ]
     for a, b in zip(steps[2:], new, strict=True):
-        assert a.move.makes is b.move.makes
-        assert (a.stance, a.move.limb) == (b.stance, b.move.limb)
+        assert a.makes is b.makes
+        assert (a.stance, a.limb) == (b.stance, b.limb)
 
 
 def test_only_the_first_move_of_a_limb_is_another(demo_plan):
     world = demo_plan.world
     steps = split_moves(demo_plan.sequence, world)[0]
-    hand = [s for s in steps if s.move.limb == "left_arm"]
+    hand = [s for s in steps if s.limb == "left_arm"]
     on = demo_plan.keyframes[1].stance
     other = tuple(replace(c, surface="LElbow") for c in on if c.surface == "LHand")
     later = hand[-1]
     new = from_here([later, later], other, world)
-    assert [s.move.breaks for s in new] == [("LElbow",), later.move.breaks]
+    assert [s.breaks for s in new] == [("LElbow",), later.breaks]
     # A limb that is in the air breaks nothing, whatever is below it.
     (air,) = from_here([hand[0]], other, world)
-    assert hand[0].move.breaks == air.move.breaks == ()
+    assert hand[0].breaks == air.breaks == ()
 
 
 @pytest.mark.parametrize("step", STEPS)

@@ -175,7 +175,7 @@ def test_the_cost_is_the_way_to_each_contact_and_its_projected_distance(demo_pla
     for before, after, path in zip(
         demo_plan.keyframes, demo_plan.keyframes[1:], demo_plan.paths, strict=False
     ):
-        made = path.transition.move.makes
+        made = path.transition.step.makes
         kin.update(before.q)
         p = kin.contact_point(made.surface, np.array([0.0, 0.0, 1.0]))
         kin.update(after.q)
@@ -192,7 +192,7 @@ def test_a_step_that_is_missed_costs_what_is_left_of_it(demo_plan):
     kin, expected = Kinematics(demo_plan.world), 0.0
     kin.update(demo_plan.keyframes[0].q)
     for step in split_moves(demo_plan.sequence, demo_plan.world)[0]:
-        c = step.move.makes
+        c = step.makes
         mass = kin.landmark(demo_plan.world.robot.limb_of(c.surface).root)[1]
         p = kin.contact_point(c.surface, np.array([0.0, 0.0, 1.0]))
         expected += np.linalg.norm(c.position - p)
@@ -239,7 +239,7 @@ def test_on_a_low_box_every_alternative_is_shorter_than_the_demonstration(
     assert costs[-1] < plan_cost(shown)
     for r in low.ranked:
         assert len(r.plan.paths) == len(shown.paths) - 2
-        made = {p.transition.move.makes.surface for p in r.plan.paths}
+        made = {p.transition.step.makes.surface for p in r.plan.paths}
         assert made == {*r.surfaces, "LKnee", "RKnee"}
 
 
@@ -328,14 +328,14 @@ def test_where_no_alternative_is_stable_the_search_takes_over(
     failing("LFoot")
     found = plan_or_replan(demo_sequence, coman, Scene.from_height(0.275))
     assert found.complete
-    made = [p.transition.move.makes.surface for p in found.paths]
+    made = [p.transition.step.makes.surface for p in found.paths]
     assert found.instead.endswith(f"instead, found by search: {', '.join(made)}")
     assert found.trajectory.keyframes[-1] > 0
     save_plan(found, tmp_path)
     again = load_plan(tmp_path)
     assert again.instead == found.instead
     steps = split_moves(again.sequence, again.world)[0]
-    assert [s.move.makes.surface for s in steps] == made
+    assert [s.makes.surface for s in steps] == made
 
 
 def on_hands(demo_sequence):
@@ -347,7 +347,7 @@ def test_where_hands_fail_elbows_take_their_place(failing, demo_sequence, coman)
     found = plan_or_replan(on_hands(demo_sequence), coman, Scene.from_height(0.2))
     assert found.complete
     assert found.instead.endswith("of the alternatives: LElbow, RElbow")
-    made = [p.transition.move.makes.surface for p in found.paths]
+    made = [p.transition.step.makes.surface for p in found.paths]
     assert made == ["LElbow", "RElbow", "LKnee", "RKnee"]
 
 
@@ -359,7 +359,7 @@ def test_the_search_goes_on_from_where_the_farthest_alternative_is_stuck(
     plain, begun = search.plan_step, []
 
     def no_right_knee(ik, before, step, *rest):
-        if step.move.makes is not None and step.move.makes.surface == "RKnee":
+        if step.makes is not None and step.makes.surface == "RKnee":
             return "sore"
         return plain(ik, before, step, *rest)
 
@@ -379,7 +379,7 @@ def test_the_search_goes_on_from_where_the_farthest_alternative_is_stuck(
     found = plan_or_replan(on_hands(demo_sequence), coman, Scene.from_height(0.2))
     assert not found.complete
     farthest, anew = begun
-    assert [s.move.limb for s in farthest] == ["left_arm", "right_arm", "left_leg"]
+    assert [s.limb for s in farthest] == ["left_arm", "right_arm", "left_leg"]
     assert anew == []
 
 
@@ -521,8 +521,8 @@ def test_the_rest_has_its_alternatives_too(demo_plan, monkeypatch):
     assert rest.complete
     assert "(an elbow is sore); instead, of the alternatives: " in rest.instead
     steps = split_moves(rest.sequence, rest.world)[0][rest.midway.made :]
-    moves = [p.transition.move for p in rest.paths]
-    assert [s.move.makes.surface for s in steps] == [m.makes.surface for m in moves]
+    moves = [p.transition.step for p in rest.paths]
+    assert [s.makes.surface for s in steps] == [m.makes.surface for m in moves]
     assert rest.paths[0].transition.stance[0].surface == "LHand"
 
 
@@ -556,7 +556,7 @@ def test_the_rest_that_was_searched_for_is_counted_from_standing(
     assert rest.complete
     assert rest.instead.endswith("found by search: RElbow, LKnee, RKnee")
     steps = split_moves(rest.sequence, rest.world)[0]
-    left = [s.move.makes.surface for s in steps[rest.midway.made :]]
+    left = [s.makes.surface for s in steps[rest.midway.made :]]
     assert left == ["RElbow", "LKnee", "RKnee"]
 
 

@@ -228,7 +228,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         cost_before=0.805,
         cost_after=0.125,
     )
-    move = SimpleNamespace(transition=SimpleNamespace(move="air -> LHand on table"))
+    move = SimpleNamespace(transition=SimpleNamespace(step="air -> LHand on table"))
     skipped = SimpleNamespace(stance=3, reason="out of reach [0.4 m]", missed=True)
     plan = SimpleNamespace(
         keyframes=(keyframe, keyframe),

@@ -46,7 +46,7 @@ def tried(monkeypatch):
     moves = []
 
     def fail(ik, before, step, *rest):
-        moves.append(step.move)
+        moves.append(step)
         return "no"
 
     monkeypatch.setattr(exploration, "plan_step", fail)
@@ -99,10 +99,10 @@ def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, 
     steps, skipped = split_moves(found.sequence, ik.world)
     assert skipped == []
     for step, path in zip(steps, found.paths, strict=True):
-        move = path.transition.move
-        assert step.move.breaks == move.breaks
-        assert step.move.makes.surface == move.makes.surface
-        assert np.allclose(step.move.makes.position, move.makes.position)
+        move = path.transition.step
+        assert step.breaks == move.breaks
+        assert step.makes.surface == move.makes.surface
+        assert np.allclose(step.makes.position, move.makes.position)
     again = retarget(found.sequence, ik.world)
     for a, b in zip(again.stances, found.sequence.stances, strict=True):
         for c, d in zip(a.contacts, b.contacts, strict=True):
@@ -242,8 +242,8 @@ def test_what_is_gone_on_from_is_part_of_what_is_found(ik, goal, demo_plan):
     assert len(ended.paths) == 6
     assert ended.keyframes[:6] == demo_plan.keyframes[:6]
     again = split_moves(ended.sequence, ik.world)[0]
-    surfaces = [s.move.makes.surface for s in again]
-    assert surfaces[:5] == [s.move.makes.surface for s in steps]
+    surfaces = [s.makes.surface for s in again]
+    assert surfaces[:5] == [s.makes.surface for s in steps]
     assert surfaces[5] == "RKnee"
 
 
@@ -258,9 +258,9 @@ def test_the_last_step_to_the_feet_rises_and_no_other_does(ik, goal, monkeypatch
         exploration, "plan_step", lambda ik, key, step, *rest: steps.append(step) or ""
     )
     search(ik, upright, start=replace(key, contacts=tuple(states)), tries=1000)
-    assert any(s.move.makes is None for s in steps)
+    assert any(s.makes is None for s in steps)
     for s in steps:
-        assert s.rises == (s.move.makes is None)
+        assert s.stands_up == (s.makes is None)
 
 
 @pytest.mark.parametrize("name", ["tries", "depth"])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.steps import SAME_PLACE, Move, split_moves
+from clamber.contact.steps import SAME_PLACE, Step, split_moves
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World, build_world
@@ -61,7 +61,7 @@ def sequence(*stances: str | list[Contact]) -> ContactSequence:
 
 def moves(world: World, *stances: str | list[Contact]) -> list[str]:
     steps, _ = split_moves(sequence(*stances), world)
-    return [f"{s.stance}: {s.move}" for s in steps]
+    return [f"{s.stance}: {s}" for s in steps]
 
 
 def skipped(world: World, *stances: str | list[Contact]) -> list[str]:
@@ -91,12 +91,12 @@ def test_a_whole_climb_is_split_limb_by_limb(world):
 
 def test_a_knee_replaces_the_foot_of_its_leg(world):
     (step,), _ = split_moves(sequence("LFoot RFoot", "LKnee RFoot"), world)
-    assert step.move.limb == "left_leg"
-    assert step.move.breaks == ("LFoot",)
-    assert step.move.makes is not None
-    assert step.move.makes.surface == "LKnee"
-    assert not step.move.firm
-    np.testing.assert_array_equal(step.move.makes.position, [0.30, 0.09, 0.275])
+    assert step.limb == "left_leg"
+    assert step.breaks == ("LFoot",)
+    assert step.makes is not None
+    assert step.makes.surface == "LKnee"
+    assert not step.fixed
+    np.testing.assert_array_equal(step.makes.position, [0.30, 0.09, 0.275])
 
 
 def test_limbs_that_change_at_once_move_one_after_the_other_arms_first(world):
@@ -177,8 +177,8 @@ def test_a_contact_that_is_not_made_again_is_broken(world):
     stances = ("LFoot RFoot", "LFoot RFoot LHand", "LFoot RFoot")
     assert moves(world, *stances) == ["1: air -> LHand on box", "2: LHand -> air"]
     (_, last), _ = split_moves(sequence(*stances), world)
-    assert last.move.makes is None
-    assert last.move.breaks == ("LHand",)
+    assert last.makes is None
+    assert last.breaks == ("LHand",)
 
 
 def test_the_robot_stands_on_both_feet_wherever_the_recording_begins(world):
@@ -217,12 +217,12 @@ def test_moves_done_in_order_lead_from_stance_to_stance(world, seed):
     assert [s.stance for s in steps] == sorted(s.stance for s in steps)
     down = {c.surface: c for c in demo.stances[0].contacts}
     for step in steps:
-        limb = world.robot.limbs[step.move.limb]
-        for s in step.move.breaks:
+        limb = world.robot.limbs[step.limb]
+        for s in step.breaks:
             assert s in limb.surfaces
             del down[s]
-        if step.move.makes is not None:
-            c = step.move.makes
+        if step.makes is not None:
+            c = step.makes
             assert c.surface in limb.surfaces
             assert c is demo.stances[step.stance].contact(c.surface)
             down[c.surface] = c
@@ -234,18 +234,18 @@ def test_moves_done_in_order_lead_from_stance_to_stance(world, seed):
 
 
 @pytest.mark.parametrize(
-    ("last", "rises"), [("LFoot RFoot", True), ("LKnee RFoot", False)]
+    ("last", "stands_up"), [("LFoot RFoot", True), ("LKnee RFoot", False)]
 )
-def test_a_step_that_ends_on_the_feet_rises_if_it_is_the_last(world, last, rises):
+def test_a_step_that_ends_on_the_feet_rises_if_it_is_the_last(world, last, stands_up):
     stances = ("LFoot RFoot", "LHand RHand LFoot RFoot", "RHand LFoot RFoot", last)
     steps = split_moves(sequence(*stances), world)[0]
-    assert [s.rises for s in steps] == [False] * (len(steps) - 1) + [rises]
+    assert [s.stands_up for s in steps] == [False] * (len(steps) - 1) + [stands_up]
 
 
 def test_a_move_says_what_it_does():
-    move = Move(limb="left_arm", breaks=("LHand",), makes=contact("LElbow"))
-    assert str(move) == "LHand -> LElbow on box"
-    assert str(Move(limb="left_arm", breaks=(), makes=contact("LHand"))).startswith(
+    step = Step(limb="left_arm", breaks=("LHand",), makes=contact("LElbow"))
+    assert str(step) == "LHand -> LElbow on box"
+    assert str(Step(limb="left_arm", breaks=(), makes=contact("LHand"))).startswith(
         "air"
     )
-    assert str(Move(limb="left_arm", breaks=("LHand",), makes=None)) == "LHand -> air"
+    assert str(Step(limb="left_arm", breaks=("LHand",), makes=None)) == "LHand -> air"

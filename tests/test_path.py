@@ -203,7 +203,7 @@ def test_the_centre_of_mass_stays_over_the_contacts_that_bear_load(
 
 def test_the_moving_surface_follows_its_arc(demo_plan, demo_kinematics):
     for path in demo_plan.paths:
-        made, swing = path.transition.move.makes, path.phases[1]
+        made, swing = path.transition.step.makes, path.phases[1]
         normal = demo_kinematics.world.supports[made.support].normal
         way = []
         for q in swing.q:
@@ -222,7 +222,7 @@ def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinemat
         for phase in path.phases:
             # At its very ends the moving surface touches what it leaves and meets.
             closed = phase.contacts
-            ends = (*closed, *t.leaving, t.move.makes)
+            ends = (*closed, *t.leaving, t.step.makes)
             inner, outer = apart(world, closed), apart(world, ends)
             for i, q in enumerate(phase.q):
                 demo_kinematics.update(q)
@@ -257,7 +257,7 @@ def test_gaps_are_halved_where_a_contact_drifts(demo_plan, ik, monkeypatch):
 
 
 def test_a_swing_straight_through_the_box_is_refused(demo_plan, ik):
-    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.move.breaks)
+    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.step.breaks)
     swing = path.phases[1]
     # The right shank, which has no business on the box, goes through its edge.
     sunk = swing.q.copy()
@@ -317,12 +317,12 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
 ):
     """Figure 4.16: the knees on their way up a high box."""
     result = plan(demo_sequence, coman, Scene.from_height(0.52))
-    knees = [p for p in result.paths if "leg" in p.transition.move.limb]
+    knees = [p for p in result.paths if "leg" in p.transition.step.limb]
     assert len(knees) == 2
     ik = IK(result.world)
     entered = []
     for path in knees:
-        limb, made = path.transition.move.limb, path.transition.move.makes
+        limb, made = path.transition.step.limb, path.transition.step.makes
         plain = plan_path(ik, path.transition, adapt=False).phases[1].q
         entered.append(min(limb_to_box(result.world, q, limb) for q in plain[1:-1]))
         for q in path.phases[1].q:

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clamber.contact.contact import Contact, Stance
+from clamber.contact.contact import Contact
 from clamber.contact.scaling import retarget
-from clamber.contact.steps import Guide, Move, Step, split_moves
+from clamber.contact.steps import Seeds, Step, split_moves
 from clamber.errors import Status
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
@@ -18,6 +18,7 @@ from clamber.model.world import build_world
 from clamber.planning import search
 from clamber.planning.planner import plan
 from clamber.planning.search import plan_steps, repairs
+from clamber.step import change
 from clamber.step.change import plan_step, standing
 from clamber.step.ik import IK
 from clamber.step.posture import KeyframeOptions
@@ -56,7 +57,7 @@ def ik(coman):
 def steps(ik, demo_sequence):
     """Both hands, both elbows, both knees."""
     steps, _ = split_moves(retarget(demo_sequence, ik.world), ik.world)
-    assert [s.move.makes.surface for s in steps] == [
+    assert [s.makes.surface for s in steps] == [
         "LHand",
         "RHand",
         "LElbow",
@@ -67,11 +68,11 @@ def steps(ik, demo_sequence):
     return steps
 
 
-def moved(step: Step, *, support: str | None = None, position, firm=False) -> Step:
+def moved(step: Step, *, support: str | None = None, position, fixed=False) -> Step:
     """The same step with its contact elsewhere."""
-    makes = step.move.makes
+    makes = step.makes
     makes = replace(makes, support=support or makes.support, position=position)
-    return replace(step, move=replace(step.move, makes=makes, firm=firm))
+    return replace(step, makes=makes, fixed=fixed)
 
 
 # Standing.
@@ -81,11 +82,12 @@ def test_who_rises_stands_as_at_first_and_else_stays_bent(ik, steps):
     """The hand lets go of the box."""
     made = find(ik, steps[:1])
     key = made.keyframes[-1]
-    move = Move(limb=steps[0].move.limb, breaks=("LHand",), makes=None)
-    step = replace(steps[0], move=move)
+    step = replace(steps[0], breaks=("LHand",), makes=None, fixed=False)
     away = []
-    for rises in (False, True):
-        again = plan_step(ik, key, replace(step, rises=rises), "direct", OPTIONS, quiet)
+    for stands_up in (False, True):
+        again = plan_step(
+            ik, key, replace(step, stands_up=stands_up), "direct", OPTIONS, quiet
+        )
         assert not isinstance(again, str)
         assert surfaces(again[0]) == {"LFoot", "RFoot"}
         joints = ik.world.qadr
@@ -131,8 +133,7 @@ def test_a_step_out_of_reach_is_skipped_with_its_reason_and_the_rest_goes_on(ik,
 
 
 def test_a_move_that_leaves_nothing_to_stand_on_is_refused(ik, steps):
-    both = Move(limb="left_leg", breaks=("LFoot", "RFoot"), makes=None)
-    step = Step(stance=1, target=steps[0].target, move=both)
+    step = Step(limb="left_leg", breaks=("LFoot", "RFoot"), makes=None)
     reason = plan_step(ik, standing(ik, OPTIONS), step, "direct", OPTIONS, quiet)
     assert reason == "LFoot, RFoot -> air: nothing else bears load"
 
@@ -145,21 +146,21 @@ def test_nothing_to_do_finds_the_start_alone(ik):
 
 def test_a_firm_contact_is_made_where_it_is_wanted(ik, steps):
     wanted = np.array([0.42, 0.12, HEIGHT])
-    found = find(ik, [moved(steps[0], position=wanted, firm=True)])
+    found = find(ik, [moved(steps[0], position=wanted, fixed=True)])
     hand = next(c for c in found.keyframes[-1].stance if c.surface == "LHand")
     assert np.linalg.norm(hand.position - wanted) < 5e-3
 
 
 def test_a_contact_that_is_not_firm_moves_towards_its_shoulder(ik, steps):
     wanted = np.array([0.42, 0.02, HEIGHT])
-    firm, free = (
-        find(ik, [moved(steps[0], position=wanted, firm=f)]).keyframes[-1]
+    fixed, free = (
+        find(ik, [moved(steps[0], position=wanted, fixed=f)]).keyframes[-1]
         for f in (True, False)
     )
-    assert free.cost_after < firm.cost_after
+    assert free.cost_after < fixed.cost_after
     d_firm, d_free = (
         next(c for c in k.contacts if c.contact.surface == "LHand").projected_distance
-        for k in (firm, free)
+        for k in (fixed, free)
     )
     assert d_free < d_firm
 
@@ -171,7 +172,7 @@ def test_a_badly_placed_knee_is_put_elsewhere_for_the_other_ones_sake(
     ik, steps, monkeypatch
 ):
     bad = np.array([0.4, -0.1, HEIGHT])  # the left knee where the right one should go
-    tangled = [*steps[:4], moved(steps[4], position=bad, firm=True), steps[5]]
+    tangled = [*steps[:4], moved(steps[4], position=bad, fixed=True), steps[5]]
     monkeypatch.setattr(search, "MAX_REPAIRS", 0)
     stuck = find(ik, tangled)
     assert [m.reason.split(":")[0] for m in stuck.missed] == ["RFoot -> RKnee on box"]
@@ -193,7 +194,7 @@ def test_no_repair_is_proposed_where_nothing_stands_on_a_contact_that_was_made(
     ik, steps
 ):
     start = standing(ik, OPTIONS)
-    assert list(repairs(ik, [start], [], steps[0].move)) == []
+    assert list(repairs(ik, [start], [], steps[0])) == []
 
 
 class FakePath(str):
@@ -217,35 +218,31 @@ class FakePlanner:
         monkeypatch.setattr(search, "repairs", self.repairs)
 
     def plan_step(self, ik, before, step, method, options, lap):
-        name = step.move.limb + ("!" if step.move.firm else "")
+        name = step.limb + ("!" if step.fixed else "")
         self.tried.append(name)
         if self.fails(name, self.tried):
             return f"{name} fails"
         return name, FakePath(name, self.margin(name, self.tried))
 
-    def repairs(self, ik, keyframes, paths, move, margin=MARGINS[-1]):
+    def repairs(self, ik, keyframes, paths, step, margin=MARGINS[-1]):
         self.asked = margin
-        better = self.repairs_to(move.limb, paths)
+        better = self.repairs_to(step.limb, paths)
         return iter([] if better is None else [better])
 
 
 def fake_steps(*names: tuple[str, int]) -> list[Step]:
-    target = Stance(contacts=())
     contact = Contact(
         surface="LHand", support="box", position=np.zeros(3), quaternion=np.eye(4)[0]
     )
-    return [
-        Step(stance=i, target=target, move=Move(limb=n, breaks=(), makes=contact))
-        for n, i in names
-    ]
+    return [Step(limb=n, breaks=(), makes=contact, stance=i) for n, i in names]
 
 
 def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     fake = FakePlanner(
         monkeypatch,
         lambda name, tried: name == "c" and "a!" not in tried,
-        lambda limb, paths: ({0: contact}, Guide()),
+        lambda limb, paths: ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
     assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
@@ -255,11 +252,11 @@ def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
 
 
 def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     fake = FakePlanner(
         monkeypatch,
         lambda name, tried: name == "b",
-        lambda limb, paths: ({0: contact}, Guide()),
+        lambda limb, paths: ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert fake.tried.count("b") == search.MAX_REPAIRS + 1
@@ -268,11 +265,11 @@ def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
 
 
 def test_a_skipped_step_between_does_not_confuse_which_step_is_mended(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     fake = FakePlanner(
         monkeypatch,
         lambda name, tried: name == "a" or (name == "c" and "b!" not in tried),
-        lambda limb, paths: None if limb == "a" else ({0: contact}, Guide()),
+        lambda limb, paths: None if limb == "a" else ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert fake.tried == ["a", "b", "c", "b!", "c"]
@@ -282,22 +279,22 @@ def test_a_skipped_step_between_does_not_confuse_which_step_is_mended(ik, monkey
 
 def test_a_step_skipped_before_and_after_a_repair_is_reported_once(ik, monkeypatch):
     """Both steps belong to one stance: the second one is tried, and missed, again."""
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     FakePlanner(
         monkeypatch,
         lambda name, tried: name == "b" or (name == "c" and "a!" not in tried),
-        lambda limb, paths: None if limb == "b" else ({0: contact}, Guide()),
+        lambda limb, paths: None if limb == "b" else ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 1), ("c", 2)))
     assert [m.reason for m in found.missed] == ["b fails"]
 
 
 def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     FakePlanner(
         monkeypatch,
         lambda name, tried: name in "bc" and "a!" not in tried,
-        lambda limb, paths: None if limb == "b" else ({0: contact}, Guide()),
+        lambda limb, paths: None if limb == "b" else ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert found.keyframes[1:] == ("a!", "b", "c")
@@ -305,11 +302,11 @@ def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
 
 
 def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     fake = FakePlanner(
         monkeypatch,
         lambda name, tried: False,
-        lambda limb, paths: ({0: contact}, Guide()),
+        lambda limb, paths: ({0: contact}, Seeds()),
         lambda name, tried: MARGINS[name == "c" and "a!" not in tried],
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
@@ -322,11 +319,11 @@ def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(ik, monkeypatch)
 
 @pytest.mark.parametrize("worse", ["a!", "b"])
 def test_no_step_loses_its_margin_to_another_one(ik, monkeypatch, worse):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     FakePlanner(
         monkeypatch,
         lambda name, tried: False,
-        lambda limb, paths: ({0: contact}, Guide()),
+        lambda limb, paths: ({0: contact}, Seeds()),
         lambda name, tried: MARGINS[name == worse if "a!" in tried else name == "c"],
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
@@ -337,11 +334,11 @@ def test_no_step_loses_its_margin_to_another_one(ik, monkeypatch, worse):
 def test_a_step_with_a_small_margin_counts_where_others_would_be_missed(
     ik, monkeypatch
 ):
-    contact = fake_steps(("a", 1))[0].move.makes
+    contact = fake_steps(("a", 1))[0].makes
     FakePlanner(
         monkeypatch,
         lambda name, tried: name == "b" and "a!" in tried,
-        lambda limb, paths: ({0: contact}, Guide()) if paths else None,
+        lambda limb, paths: ({0: contact}, Seeds()) if paths else None,
         lambda name, tried: MARGINS[name == "c"],
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
@@ -357,7 +354,7 @@ def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkey
         flat = all(c.edge is None for c in held)
         return "too far" if flat else ("keyframe", "path")
 
-    monkeypatch.setattr(search, "_plan_on", planner)
+    monkeypatch.setattr(change, "_plan_on", planner)
     start = standing(ik, OPTIONS)
     found = plan_step(ik, start, steps[0], "direct", OPTIONS, quiet)
     assert found == ("keyframe", "path")
@@ -372,7 +369,7 @@ def test_the_reason_is_that_of_flat_feet_where_tiptoe_does_not_help(
     ik, steps, monkeypatch
 ):
     reasons = iter(["flat", "tiptoe"])
-    monkeypatch.setattr(search, "_plan_on", lambda *_: next(reasons))
+    monkeypatch.setattr(change, "_plan_on", lambda *_: next(reasons))
     start = standing(ik, OPTIONS)
     assert plan_step(ik, start, steps[0], "direct", OPTIONS, quiet) == "flat"
 

@@ -320,7 +320,7 @@ def test_a_limb_that_goes_up_does_not_graze_the_riser_of_its_tread(climbing):
             q = interpolate(task.ik.kin, a, b, 0.5)
             task.ik.kin.update(q)
             p = task.ik.kin.contact_point(
-                path.transition.move.makes.surface, np.array([0.0, 0.0, 1.0])
+                path.transition.step.makes.surface, np.array([0.0, 0.0, 1.0])
             )
             away = min(np.linalg.norm(p - start), np.linalg.norm(p - end))
             if away > 0.25 * np.linalg.norm(end - start):

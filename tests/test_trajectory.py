@@ -36,7 +36,7 @@ from clamber.step.statics import (
 @pytest.fixture(scope="module")
 def knee_phases(demo_plan):
     """Shift, swing and settle of the left knee."""
-    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.move.breaks)
+    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.step.breaks)
     return path.phases
 
 

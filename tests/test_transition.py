@@ -156,7 +156,7 @@ def test_the_new_contact_touches_while_those_that_stay_are_closed(
 ):
     for t in transitions:
         demo_kinematics.update(t.touching)
-        for c in (*t.held, t.move.makes):
+        for c in (*t.held, t.step.makes):
             assert contact_drift(demo_kinematics, c) < 1e-3
             support = demo_kinematics.world.supports[c.support]
             points = demo_kinematics.bearing_points(c.surface, support.normal, c.edge)
@@ -171,14 +171,14 @@ def test_transitions_lead_from_keyframe_to_keyframe(demo_plan, transitions):
         assert np.array_equal(t.before, a.q)
         assert np.array_equal(t.after, b.q)
         names = {c.surface for c in t.held}
-        assert names | {t.move.makes.surface} == {c.surface for c in b.stance}
+        assert names | {t.step.makes.surface} == {c.surface for c in b.stance}
         assert names | {c.surface for c in t.leaving} == {c.surface for c in a.stance}
 
 
 def test_a_worse_posture_is_named(demo_plan, ik):
     """A contact out of reach: the transition says so instead of pretending."""
     before, after = demo_plan.keyframes[1:3]
-    move = demo_plan.paths[1].transition.move
+    move = demo_plan.paths[1].transition.step
     far = replace(move.makes, position=move.makes.position + 0.6 * AHEAD)
     states = tuple(
         replace(s, contact=far) if s.contact.surface == far.surface else s
@@ -226,7 +226,7 @@ def test_a_foot_on_an_edge_stays_on_it(ik, demo_plan):
 def test_joints_too_weak_for_a_shift_are_named(demo_plan, ik):
     """The same postures, but motors that cannot hold them."""
     before, after = demo_plan.keyframes[4:6]
-    move = demo_plan.paths[4].transition.move
+    move = demo_plan.paths[4].transition.step
     weak = IK(replace(ik.world, tau_max=0.05 * ik.world.tau_max))
     strong, feeble = (
         plan_transition(x, before, after, move, margin=0.025) for x in (ik, weak)

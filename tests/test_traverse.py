@@ -189,8 +189,8 @@ def test_where_there_is_no_way_down_contacts_move_to_where_there_is(task, monkey
 def test_the_last_step_of_a_descent_rises(task):
     """A robot that stays bent has its weight near its toes, and tips over them."""
     _, rows = module._descent(task, task.platforms[0])
-    assert [step.rises for step, _ in rows] == [False] * (len(rows) - 1) + [True]
-    last = rows[-1][0].move
+    assert [step.stands_up for step, _ in rows] == [False] * (len(rows) - 1) + [True]
+    last = rows[-1][0]
     assert last.makes is None
     assert task.ik.world.robot.limb_of(last.breaks[0]).is_arm
 
@@ -561,7 +561,7 @@ def test_a_limb_that_lost_its_contact_is_set_down_first(crossing, lost):
     key = direct.optimise(ik, task, middle.q, PlanOptions().keyframe)
     found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
     assert not found.missed
-    move = found.paths[0].transition.move
+    move = found.paths[0].transition.step
     assert move.makes.surface == lost
     assert move.breaks == ()
     assert len(found.keyframes[-1].stance) == 4

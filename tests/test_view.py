@@ -241,7 +241,7 @@ def test_saving_writes_a_run_of_its_own_and_overwrites_nothing(
     assert not (tmp_path / "nowhere").exists()
     assert clamber.load_plan(first).complete
     back = clamber.load_sequence(first)
-    assert [c.firm for c in back.stances[1].contacts] == [False, False, True]
+    assert [c.fixed for c in back.stances[1].contacts] == [False, False, True]
 
 
 # Bad input.

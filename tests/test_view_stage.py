@@ -494,7 +494,7 @@ def test_a_moved_contact_is_moved_in_all_stances_that_hold_it(two_hands_plan: Pl
         for c, d in zip(a.contacts, b.contacts, strict=True):
             if c.surface == "LHand":
                 np.testing.assert_allclose(d.position, place)
-                assert d.firm
+                assert d.fixed
                 assert i >= 1
             else:
                 assert d is c

@@ -180,7 +180,7 @@ def transition(plan) -> Figure:
         ax.plot(*way.T, color=BLUE, lw=1.5)
         ax.plot(*way[0], "o", color="w", mec=BLUE, label="before")
         ax.plot(*way[-1], "o", color=BLUE, label="after")
-        ax.set(aspect="equal", title=str(t.move), xlabel="to the right [m]")
+        ax.set(aspect="equal", title=str(t.step), xlabel="to the right [m]")
         ax.set_ylabel("ahead [m]")
         finish_axes(ax)
         ax.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.9))
@@ -206,7 +206,7 @@ def paths(plan) -> Figure:
     up = np.array([0.0, 0.0, 1.0])
     for path, colour in ((plan.paths[0], BLUE), (plan.paths[-2], RED)):
         (swing,) = [p for p in path.phases if p.kind == "swing"]
-        move = path.transition.move
+        move = path.transition.step
         kin, way = Kinematics(plan.world), []
         surface = move.makes.surface
         for q in swing.q:

@@ -188,7 +188,7 @@ def new_table(*columns: str, numbers: bool = False) -> Table:
 
 def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any]:
     """What `--json` says of a plan; costs and margins are those of `plan.json`."""
-    moves = [None, *(p.transition.move for p in plan.paths)]
+    moves = [None, *(p.transition.step for p in plan.paths)]
     keyframes = []
     for i, key in enumerate(plan.keyframes):
         move = moves[i] if i < len(moves) else None

@@ -45,7 +45,7 @@ class Contact:
         link: (4,) orientation of a round surface's link in the world where it touches
             at `position`; as the link turns, the surface rolls from there. None where
             the contact is not a robot's posture yet.
-        firm: A person put it there: the position is no reference but where it is to be
+        fixed: A person put it there: the position is no reference but where it is to be
             planned, or as near as can be reached.
     """
 
@@ -55,7 +55,7 @@ class Contact:
     quaternion: np.ndarray
     edge: int | None = None
     link: np.ndarray | None = None
-    firm: bool = False
+    fixed: bool = False
 
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""

@@ -155,7 +155,7 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
             support=support,
             position=position,
             quaternion=quat_from_matrix(R),
-            firm=c.firm,
+            fixed=c.fixed,
         )
 
     stances = []

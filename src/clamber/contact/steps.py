@@ -1,4 +1,4 @@
-"""A contact sequence as moves: one limb at a time changes its contact."""
+"""A contact sequence as steps: one limb at a time changes its contact."""
 
 from __future__ import annotations
 
@@ -10,34 +10,13 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.model.world import World
 
+NOT_SHOWN = Stance(contacts=())  # of a step that no demonstration shows
 SAME_PLACE = 0.03  # [m] a contact made again nearer than this has not moved
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Move:
-    """One limb's change of contact.
-
-    Attributes:
-        limb: Its name.
-        breaks: Surfaces that leave their contacts.
-        makes: The contact that is made, its position a reference until optimised.
-        firm: The position is taken as it is, or as near as can be reached.
-    """
-
-    limb: str
-    breaks: tuple[str, ...]
-    makes: Contact | None
-    firm: bool = False
-
-    def __str__(self) -> str:
-        """Such as `LHand -> LElbow on box`."""
-        made = f"{self.makes.surface} on {self.makes.support}" if self.makes else "air"
-        return f"{', '.join(self.breaks) or 'air'} -> {made}"
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Guide:
-    """Postures (nq,) near those that a move goes through, as far as they are known.
+class Seeds:
+    """Postures (nq,) near those that a step goes through, as far as they are known.
 
     Attributes:
         shifted: The weight on the contacts that stay.
@@ -50,26 +29,38 @@ class Guide:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Step:
-    """A move, and the stance of the demonstration that it leads to.
+    """One limb's change of contact.
 
     Attributes:
-        stance: Index of the stance in the sequence; `target` is it.
-        move: What changes.
-        guide: Where its postures may be found.
+        limb: Its name.
+        breaks: Surfaces that leave their contacts.
+        makes: The contact that is made, its position a reference until optimised.
+        fixed: The position is taken as it is, or as near as can be reached.
+        target: The stance of the demonstration that it leads to.
+        stance: Its index in the sequence.
+        seeds: Where its postures may be found.
         base_rotation: (3, 3) R_WB of the pelvis that is preferred, or None.
         reference: (nq,) the posture to stay close to; None: the one before.
-        rises: To the posture that the robot starts in, which goes before these: it is
-            the last step, and ends on the feet. A person who has just got up is bent,
-            and so is a robot that held on till then.
+        stands_up: To the posture that the robot starts in, which goes before these: it
+            is the last step, and ends on the feet. A person who has just got up is
+            bent, and so is a robot that held on till then.
     """
 
-    stance: int
-    target: Stance
-    move: Move
-    guide: Guide = Guide()
+    limb: str
+    breaks: tuple[str, ...]
+    makes: Contact | None
+    fixed: bool = False
+    target: Stance = NOT_SHOWN
+    stance: int = 0
+    seeds: Seeds = Seeds()
     base_rotation: np.ndarray | None = None
     reference: np.ndarray | None = None
-    rises: bool = False
+    stands_up: bool = False
+
+    def __str__(self) -> str:
+        """Such as `LHand -> LElbow on box`."""
+        made = f"{self.makes.surface} on {self.makes.support}" if self.makes else "air"
+        return f"{', '.join(self.breaks) or 'air'} -> {made}"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -90,7 +81,7 @@ class Skipped:
 def split_moves(
     sequence: ContactSequence, world: World
 ) -> tuple[list[Step], list[Skipped]]:
-    """Split each change of stance into moves of one limb, or say why there is none.
+    """Split each change of stance into steps of one limb, or say why there is none.
 
     A limb that only leaves its contact is part of its next move where it has one. Where
     two surfaces of a limb are down at once, the one nearer to the trunk bears the load.
@@ -133,15 +124,22 @@ def split_moves(
                 breaks = (down,) if down is not None else ()
             closed[limb.name] = makes
             standing.discard(limb.name)
-            firm = makes is not None and makes.firm
-            move = Move(limb=limb.name, breaks=breaks, makes=makes, firm=firm)
-            steps.append(Step(stance=i, target=stance, move=move))
+            steps.append(
+                Step(
+                    limb=limb.name,
+                    breaks=breaks,
+                    makes=makes,
+                    fixed=makes is not None and makes.fixed,
+                    target=stance,
+                    stance=i,
+                )
+            )
         if len(steps) == before:
             reason = "; ".join(reasons) or "no limb makes or leaves a bearing contact"
             skipped.append(Skipped(stance=i, reason=reason))
     if steps:
         last = [c for c in closed.values() if c is not None]
-        steps[-1] = replace(steps[-1], rises=on_feet(world, last))
+        steps[-1] = replace(steps[-1], stands_up=on_feet(world, last))
     return steps, skipped
 
 

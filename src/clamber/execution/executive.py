@@ -742,14 +742,14 @@ class Execution:
         a, b = (self._keyframes[j].stance for j in (self._leg - 1, self._leg))
         gone = {c.surface for c in a} - {c.surface for c in b}
         for k in range(self._made, len(self._steps)):
-            move = self._steps[k].move
+            step = self._steps[k]
             if leg.made is None:
-                same = move.makes is None and set(move.breaks) == gone
+                same = step.makes is None and set(step.breaks) == gone
             else:
                 same = (
-                    move.makes is not None
-                    and move.makes.surface == leg.made.surface
-                    and move.makes.support == leg.made.support
+                    step.makes is not None
+                    and step.makes.surface == leg.made.surface
+                    and step.makes.support == leg.made.support
                 )
             if same:
                 self._made = k + 1

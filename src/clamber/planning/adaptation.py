@@ -236,9 +236,9 @@ def from_here(steps: list[Step], stance: Sequence[Contact], world: World) -> lis
     on = {world.robot.limb_of(c.surface).name: c.surface for c in stance}
     out = []
     for step in steps:
-        surface = on.pop(step.move.limb, None)
-        if surface is not None and step.move.breaks:
-            step = replace(step, move=replace(step.move, breaks=(surface,)))
+        surface = on.pop(step.limb, None)
+        if surface is not None and step.breaks:
+            step = replace(step, breaks=(surface,))
         out.append(step)
     return out
 

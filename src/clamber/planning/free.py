@@ -21,14 +21,14 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Region, Stance, region_of
 from clamber.contact.policy import GeneralPolicy
 from clamber.contact.scaling import near_edge
-from clamber.contact.steps import Move, Step, on_feet, split_moves
+from clamber.contact.steps import Step, on_feet, split_moves
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND
@@ -129,9 +129,9 @@ def action_counts(sequence: ContactSequence, world: World) -> Counts:
     counts: Counter[tuple[Region, str]] = Counter()
     stance = sequence.stances[0].contacts
     for step in split_moves(sequence, world)[0]:
-        if step.move.makes is not None:
-            counts[region_of(stance), step.move.makes.surface] += 1
-        stance = _after(stance, step.move)
+        if step.makes is not None:
+            counts[region_of(stance), step.makes.surface] += 1
+        stance = _after(stance, step)
     return counts
 
 
@@ -201,7 +201,7 @@ def explore(
             push(state, a)
 
     def priority(state: Reached, a: _Action) -> float:
-        after = _after(state.keyframes[-1].stance, a.step.move)
+        after = _after(state.keyframes[-1].stance, a.step)
         again = AGAIN * often[_kind(after)]
         return state.cost + a.price + EAGER * guide.left(after) + again
 
@@ -230,7 +230,7 @@ def explore(
             return ended(None, Stop.TRIES)
         entry = heapq.heappop(queue)
         state, action = entry.state, entry.action
-        after = _after(state.keyframes[-1].stance, action.step.move)
+        after = _after(state.keyframes[-1].stance, action.step)
         if _key(after) in seen:  # reached meanwhile, at less cost
             continue
         if priority(state, action) > entry.priority:
@@ -238,7 +238,7 @@ def explore(
             continue
         tries += 1
         often[_kind(after)] += 1
-        report("explore", tries / bounds.tries, str(action.step.move))
+        report("explore", tries / bounds.tries, str(action.step))
         reached = _take(ik, state, action, options)
         if reached is None:
             continue
@@ -273,10 +273,10 @@ def _take(
     )
 
 
-def _after(stance: Sequence[Contact], move: Move) -> tuple[Contact, ...]:
-    """The stance after a move, the new contact where it is wanted."""
-    kept = tuple(c for c in stance if c.surface not in move.breaks)
-    return kept if move.makes is None else (*kept, move.makes)
+def _after(stance: Sequence[Contact], step: Step) -> tuple[Contact, ...]:
+    """The stance after a step, the new contact where it is wanted."""
+    kept = tuple(c for c in stance if c.surface not in step.breaks)
+    return kept if step.makes is None else (*kept, step.makes)
 
 
 def _key(stance: Sequence[Contact]) -> frozenset:
@@ -303,9 +303,9 @@ def _as_sequence(world: World, state: Reached) -> ContactSequence:
         fresh = {c.surface: c for c in key.stance}
         contacts = [
             c
-            if step.move.makes is None or c.surface != step.move.makes.surface
+            if step.makes is None or c.surface != step.makes.surface
             else fresh[c.surface]
-            for c in _after(contacts, step.move)
+            for c in _after(contacts, step)
         ]
         stances.append(Stance(contacts=tuple(contacts), posture=step.target.posture))
     return ContactSequence(
@@ -408,8 +408,8 @@ class _Guidance:
             others = [c for c in key.stance if c is not present]
             root = kin.landmark(limb.root)[1].copy()
             if self._stands and limb.is_arm and present is not None:
-                leaves = Move(limb=limb.name, breaks=(present.surface,), makes=None)
-                out.append(_Action(step=self._step(key, leaves), price=self._even))
+                leaves = Step(limb=limb.name, breaks=(present.surface,), makes=None)
+                out.append(_Action(step=self._aimed(key, leaves), price=self._even))
             for surface in limb.surfaces:
                 for support in world.supports:
                     for c in self._contacts(surface, support, root):
@@ -417,7 +417,7 @@ class _Guidance:
                             continue
                         if not all(self._within_reach(c, o) for o in others):
                             continue
-                        move = Move(
+                        step = Step(
                             limb=limb.name,
                             breaks=() if present is None else (present.surface,),
                             makes=c,
@@ -425,7 +425,7 @@ class _Guidance:
                         r = float(np.linalg.norm(c.position - root))
                         stretch = max(0.0, r / self._length[surface] - 1.0)
                         price = self._surprise(region, surface) + stretch
-                        out.append(_Action(step=self._step(key, move), price=price))
+                        out.append(_Action(step=self._aimed(key, step), price=price))
         return out
 
     def _surprise(self, region: Region, surface: str) -> float:
@@ -453,21 +453,21 @@ class _Guidance:
         local = s.rotation.T @ (p - s.position)
         return s.position + s.rotation @ np.array([*np.clip(local[:2], -half, half), 0])
 
-    def _step(self, key: Keyframe, move: Move) -> Step:
+    def _aimed(self, key: Keyframe, step: Step) -> Step:
         """With the demonstrated stance most like the one it leads to."""
-        after = {(c.surface, c.support) for c in _after(key.stance, move)}
+        contacts = _after(key.stance, step)
+        after = {(c.surface, c.support) for c in contacts}
 
         def unlike(i: int) -> int:
             there = self._sequence.stances[i].contacts
             return len(after ^ {(c.surface, c.support) for c in there})
 
         i = min(range(len(self._sequence.stances)), key=unlike)
-        contacts = _after(key.stance, move)
-        return Step(
+        return replace(
+            step,
             stance=i,
             target=self._sequence.stances[i],
-            move=move,
-            rises=on_feet(self._world, contacts) and self.left(contacts) == 0,
+            stands_up=on_feet(self._world, contacts) and self.left(contacts) == 0,
         )
 
     def _longest(self, surface: str) -> float:

@@ -28,7 +28,7 @@ from clamber.contact.policy import (
     pelvis_distribution,
     pelvis_rotation,
 )
-from clamber.contact.steps import Guide, Move, Skipped, Step
+from clamber.contact.steps import Seeds, Skipped, Step
 from clamber.errors import InputError
 from clamber.model.robot import Robot
 from clamber.model.scene import GROUND, Scene
@@ -522,8 +522,7 @@ def _ascent(task: _Task, edge: Edge, platform: Platform) -> list[tuple[Step, str
             if not limb.is_arm and not breaks:
                 breaks = (limb.surfaces[0],)
             at[limb.name] = surface
-            move = Move(limb=limb.name, breaks=breaks, makes=contact)
-            step = Step(stance=0, target=Stance(contacts=()), move=move)
+            step = Step(limb=limb.name, breaks=breaks, makes=contact)
             rows.append((step, option.name))
         if option.region == "O":
             break
@@ -551,9 +550,9 @@ def _left_of(
     done = []
     for limb, surface in now.items():
         for i, (step, _) in enumerate(rows):
-            makes = step.move.makes
-            if step.move.limb == limb and makes and makes.surface == surface:
-                done += [j for j in range(i + 1) if rows[j][0].move.limb == limb]
+            makes = step.makes
+            if step.limb == limb and makes and makes.surface == surface:
+                done += [j for j in range(i + 1) if rows[j][0].limb == limb]
     left = [i for i in range(len(rows)) if i not in done]
     return [rows[i][0] for i in left], [rows[i][1] for i in left]
 
@@ -579,21 +578,21 @@ def _descent(
     out = []
     for path, (_, name) in zip(found.paths[::-1], rows[::-1], strict=True):
         t = path.transition
-        made = t.move.makes
+        made = t.step.makes
         assert made is not None
         before = t.leaving[0] if t.leaving else None
-        move = Move(limb=t.move.limb, breaks=(made.surface,), makes=before, firm=True)
-        guide = Guide(shifted=t.touching, touching=t.shifted)
+        seeds = Seeds(shifted=t.touching, touching=t.shifted)
         reference = home if before is None else None
         out.append(
             (
                 Step(
-                    stance=0,
-                    target=Stance(contacts=()),
-                    move=move,
-                    guide=guide,
+                    limb=t.step.limb,
+                    breaks=(made.surface,),
+                    makes=before,
+                    fixed=True,
+                    seeds=seeds,
                     reference=reference,
-                    rises=path is found.paths[0],
+                    stands_up=path is found.paths[0],
                 ),
                 name,
             )
@@ -613,13 +612,13 @@ def _climb_down(
     now = {robot.limb_of(c.surface).name: c.surface for c in key.stance}
     steps, names = [], []
     for step, name in there:
-        limb = step.move.limb
-        if now.get(limb) not in step.move.breaks:
+        limb = step.limb
+        if now.get(limb) not in step.breaks:
             continue
-        if step.move.makes is None:
+        if step.makes is None:
             del now[limb]
         else:
-            now[limb] = step.move.makes.surface
+            now[limb] = step.makes.surface
         steps.append(step)
         names.append(name)
     if not steps:
@@ -1143,11 +1142,11 @@ def _attempt(
             world, surface, Place(support=place.support, position=position), body.yaw
         )
         breaks = () if here is None else (here.surface,)
-        move = Move(limb=limb.name, breaks=breaks, makes=contact, firm=True)
         step = Step(
-            stance=0,
-            target=Stance(contacts=()),
-            move=move,
+            limb=limb.name,
+            breaks=breaks,
+            makes=contact,
+            fixed=True,
             base_rotation=_pelvis(task, key, body) if imposed else None,
             reference=reference,
         )

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from clamber.contact.contact import Contact
-from clamber.contact.steps import Guide, Move, Skipped, Step
+from clamber.contact.steps import Seeds, Skipped, Step
 from clamber.step.change import plan_step, standing
 from clamber.step.ik import IK
 from clamber.step.path import Path
@@ -71,7 +71,7 @@ def plan_steps(
     mended = k = 0
     while k < len(steps):
         step = steps[k]
-        report("plan", k / len(steps), str(step.move))
+        report("plan", k / len(steps), str(step))
         result = plan_step(ik, keyframes[-1], step, method, options, lap)
         if not isinstance(result, str):
             made, done = [result], [*done, k]
@@ -90,15 +90,15 @@ def plan_steps(
             continue
         better = None
         if mended < MAX_REPAIRS:
-            better = next(repairs(ik, keyframes, paths, step.move), None)
+            better = next(repairs(ik, keyframes, paths, step), None)
             lap("repairs")
         if better is None:
             missed[k] = Skipped(stance=step.stance, reason=result, missed=True)
             k += 1
             continue
         mended += 1
-        places, guide = better
-        steps[k] = replace(step, guide=guide)
+        places, seeds = better
+        steps[k] = replace(step, seeds=seeds)
         for j, contact in places.items():
             steps[done[j]] = _placed(steps[done[j]], contact)
         j = min(places)
@@ -116,7 +116,7 @@ def _margin(path: Path) -> float:
 
 def _placed(step: Step, contact: Contact) -> Step:
     """The step, its contact made there and nowhere else."""
-    return replace(step, move=replace(step.move, makes=contact, firm=True))
+    return replace(step, makes=contact, fixed=True)
 
 
 def _roomier(
@@ -137,10 +137,10 @@ def _roomier(
         planned for them; None where that does not help.
     """
     step = making[-1]
-    for places, guide in repairs(ik, keyframes, paths, step.move, margin=MARGINS[0]):
+    for places, seeds in repairs(ik, keyframes, paths, step, margin=MARGINS[0]):
         lap("repairs")
         j = min(places)
-        again = [*making[j:-1], replace(step, guide=guide)]
+        again = [*making[j:-1], replace(step, seeds=seeds)]
         for i, contact in places.items():
             again[i - j] = _placed(again[i - j], contact)
         key, made = keyframes[j], []
@@ -160,26 +160,26 @@ def repairs(
     ik: IK,
     keyframes: list[Keyframe],
     paths: list[Path],
-    move: Move,
+    step: Step,
     *,
     margin: float = MARGINS[-1],
-) -> Iterator[tuple[dict[int, Contact], Guide]]:
-    """Which earlier paths should have made their contacts elsewhere for `move` to work.
+) -> Iterator[tuple[dict[int, Contact], Seeds]]:
+    """Which earlier paths should have made their contacts elsewhere for `step` to work.
 
     Looks at one contact after the other, the last one first, and then at all at once.
 
     Yields:
         By index of the path, the contact at its better place, and the posture that
-        `move` then goes through.
+        `step` then goes through.
     """
-    standing_on = {c.surface for c in keyframes[-1].stance} - set(move.breaks)
+    standing_on = {c.surface for c in keyframes[-1].stance} - set(step.breaks)
     made: dict[str, int] = {}
     for j in range(len(paths) - 1, -1, -1):
-        new = paths[j].transition.move.makes
+        new = paths[j].transition.step.makes
         if new is not None and new.surface in standing_on and new.surface not in made:
             made[new.surface] = j
     for surfaces in (*([x] for x in made), list(made)):
-        eased = eased_contacts(ik, keyframes[-1], move, surfaces, margin=margin)
+        eased = eased_contacts(ik, keyframes[-1], step, surfaces, margin=margin)
         if eased is not None:
-            contacts, guide = eased
-            yield {made[c.surface]: c for c in contacts}, guide
+            contacts, seeds = eased
+            yield {made[c.surface]: c for c in contacts}, seeds

@@ -229,7 +229,7 @@ def plan_cost(made: Plan) -> float:
     for before, after, path in zip(
         made.keyframes, made.keyframes[1:], made.paths, strict=False
     ):
-        c = path.transition.move.makes
+        c = path.transition.step.makes
         if c is not None:
             d = next(
                 s.projected_distance
@@ -238,7 +238,7 @@ def plan_cost(made: Plan) -> float:
             )
             total += _way(kin, before.q, c) + d
     for step in _missed(steps[k:], made):
-        c = step.move.makes
+        c = step.makes
         if c is None:
             continue
         q = made.keyframes[-1].q if made.keyframes else world.home
@@ -257,14 +257,14 @@ def _way(kin: Kinematics, q: np.ndarray, c: Contact) -> float:
 
 def _missed(steps: Sequence[Step], made: Plan) -> list[Step]:
     """Steps that no path of the plan makes."""
-    moves = [p.transition.move for p in made.paths]
+    moves = [p.transition.step for p in made.paths]
     out = []
     for step in steps:
         m = moves[0] if moves else None
         if (
             m is not None
-            and m.limb == step.move.limb
-            and _made(m.makes) == _made(step.move.makes)
+            and m.limb == step.limb
+            and _made(m.makes) == _made(step.makes)
         ):
             moves.pop(0)
         else:
@@ -397,10 +397,17 @@ def _reached(made: Plan) -> Reached:
     for path, step in zip(
         made.paths, split_moves(made.sequence, made.world)[0], strict=False
     ):
-        move = path.transition.move
-        if move.limb != step.move.limb or _made(move.makes) != _made(step.move.makes):
+        made_step = path.transition.step
+        if made_step.limb != step.limb or _made(made_step.makes) != _made(step.makes):
             break
-        steps.append(replace(step, move=move))
+        steps.append(
+            replace(
+                step,
+                breaks=made_step.breaks,
+                makes=made_step.makes,
+                fixed=made_step.fixed,
+            )
+        )
     n = len(steps)
     return Reached(
         keyframes=made.keyframes[: n + 1], paths=made.paths[:n], steps=tuple(steps)
@@ -461,7 +468,7 @@ def _plan_of(
 
 def _surfaces(explored: Explored) -> tuple[str, ...]:
     """Surfaces that make contacts, in order."""
-    moves = (p.transition.move for p in explored.paths)
+    moves = (p.transition.step for p in explored.paths)
     return tuple(m.makes.surface for m in moves if m.makes is not None)
 
 
@@ -610,8 +617,8 @@ def _leaving(
     on = {world.robot.limb_of(c.surface).name: (c.surface,) for c in stance}
     out = []
     for step in steps:
-        breaks = on.pop(step.move.limb, step.move.breaks)
-        out.append(replace(step, move=replace(step.move, breaks=breaks)))
+        breaks = on.pop(step.limb, step.breaks)
+        out.append(replace(step, breaks=breaks))
     return out
 
 
@@ -749,7 +756,7 @@ def steps_made(
     }
     best, made = _alike(on, now), 0  # more limbs first, then nearer
     for k, step in enumerate(split_moves(sequence, world)[0], start=1):
-        m = step.move
+        m = step
         on[m.limb] = m.makes
         if m.makes is not None and _made(now.get(m.limb)) != _made(m.makes):
             continue

@@ -389,7 +389,7 @@ class _ContactFile(pydantic.BaseModel):
     quaternion: Quaternion
     edge: int | None = None
     link: Quaternion | None = None
-    firm: bool = False
+    fixed: bool = False
 
     def contact(self) -> Contact:
         return Contact(
@@ -399,12 +399,12 @@ class _ContactFile(pydantic.BaseModel):
             quaternion=np.array(self.quaternion),
             edge=self.edge,
             link=None if self.link is None else np.array(self.link),
-            firm=self.firm,
+            fixed=self.fixed,
         )
 
 
 def contact_fields(c: Contact) -> dict[str, Any]:
-    """A contact by the keys of `sequence.json`; `edge`, `link`, `firm` where it is."""
+    """A contact by the keys of `sequence.json`; `edge`, `link`, `fixed` where it is."""
     out: dict[str, Any] = {
         "surface": c.surface,
         "support": c.support,
@@ -413,7 +413,7 @@ def contact_fields(c: Contact) -> dict[str, Any]:
     }
     return out | {
         k: v
-        for k, v in (("edge", c.edge), ("link", c.link), ("firm", c.firm or None))
+        for k, v in (("edge", c.edge), ("link", c.link), ("fixed", c.fixed or None))
         if v is not None
     }
 
@@ -834,7 +834,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
                 "breaks": m.breaks,
                 "makes": None if m.makes is None else contact_fields(m.makes),
             }
-            for m in (p.transition.move for p in plan.paths)
+            for m in (p.transition.step for p in plan.paths)
         ],
         "skipped": [asdict(s) for s in plan.skipped],
         "sequence": sequence_fields(plan.sequence)
@@ -1199,7 +1199,7 @@ def save_replanned(found: Replanned, folder: str | Path) -> None:
                     "surfaces": r.surfaces,
                     "cost": r.cost,
                     "stable": r.stable,
-                    "moves": [str(p.transition.move) for p in r.plan.paths],
+                    "moves": [str(p.transition.step) for p in r.plan.paths],
                     "missed": [s.reason for s in r.plan.skipped if s.missed],
                 }
                 for r in found.ranked

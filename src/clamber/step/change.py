@@ -113,14 +113,13 @@ def plan_step(
     lap: Callable[[str], None],
 ) -> tuple[Keyframe, Path] | str:
     """The next keyframe and the path to it, or why there is none."""
-    move = step.move
-    held = tuple(c for c in before.stance if c.surface not in move.breaks)
+    held = tuple(c for c in before.stance if c.surface not in step.breaks)
     if not held:
-        return f"{move}: nothing else bears load"
+        return f"{step}: nothing else bears load"
     result = _plan_on(ik, before, step, held, method, options, lap)
-    if isinstance(result, str) and move.makes:
+    if isinstance(result, str) and step.makes:
         # On tiptoe, feet that stay reach farther.
-        tiptoe = tuple(rolled(ik, before.q, c, move.makes.position) for c in held)
+        tiptoe = tuple(rolled(ik, before.q, c, step.makes.position) for c in held)
         if any(a is not b for a, b in zip(held, tiptoe, strict=True)):
             other = _plan_on(ik, before, step, tiptoe, method, options, lap)
             if not isinstance(other, str):
@@ -138,8 +137,8 @@ def _plan_on(
     lap: Callable[[str], None],
 ) -> tuple[Keyframe, Path] | str:
     """The next keyframe and the path to it on the contacts `held`, or why not."""
-    move, world = step.move, ik.world
-    new = (move.makes,) if move.makes else ()
+    world = ik.world
+    new = (step.makes,) if step.makes else ()
     task = KeyframeTask(
         held=held,
         new=new,
@@ -148,23 +147,23 @@ def _plan_on(
         base_rotation=step.base_rotation,
     )
     begin = before.q
-    if step.rises:
+    if step.stands_up:
         begin = _home_over(world, (*held, *new))
         task = replace(task, q_reference=begin, directions={})
-    wanted, result = move.makes, "nothing tried"
-    for there in (True, False) if move.firm else (False, True):
+    wanted, result = step.makes, "nothing tried"
+    for there in (True, False) if step.fixed else (False, True):
         if wanted is not None and there:
             # Put the contact where the unloaded robot reaches it.
             key = _keyframe_there(ik, task, wanted, step, before.q, method, options)
         else:
             key = METHODS[method](ik, task, begin, options)
-            if move.makes is not None:
-                wanted = next(c for c in key.stance if c.surface == move.makes.surface)
+            if step.makes is not None:
+                wanted = next(c for c in key.stance if c.surface == step.makes.surface)
         lap("keyframes")
         result = _best_margin(ik, before, key, step, lap)
         if not isinstance(result, str):
             return key, result
-        if move.makes is None:
+        if step.makes is None:
             break
     return result
 
@@ -173,26 +172,23 @@ def _best_margin(
     ik: IK, before: Keyframe, key: Keyframe, step: Step, lap: Callable[[str], None]
 ) -> Path | str:
     """The path with the largest of `MARGINS` for which there is one, or why not."""
-    move = step.move
     if key.status is Status.OVERLOADED:
         ik.kin.update(key.q)
-        return f"{move}: {weakness(ik.kin, key.stance)}"
+        return f"{step}: {weakness(ik.kin, key.stance)}"
     if key.status is not Status.SOLVED:
-        return f"{move}: {key.status.value}"
+        return f"{step}: {key.status.value}"
     reason = ""
     for margin in MARGINS:
-        transition = plan_transition(
-            ik, before, key, move, margin=margin, guide=step.guide
-        )
+        transition = plan_transition(ik, before, key, step, margin=margin)
         lap("transitions")
         if transition.status is not Status.SOLVED:
-            reason = f"{move}: {transition.note or transition.status.value}"
+            reason = f"{step}: {transition.note or transition.status.value}"
             continue
         path = plan_path(ik, transition)
         lap("paths")
         if path.status is Status.SOLVED:
             return path
-        reason = f"{move}: {path.note or path.status.value}"
+        reason = f"{step}: {path.note or path.status.value}"
     return reason
 
 
@@ -206,7 +202,7 @@ def _keyframe_there(
     options: KeyframeOptions,
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
-    contact, solution = approach_contact(ik, task.held, wanted, q, step.guide.touching)
+    contact, solution = approach_contact(ik, task.held, wanted, q, step.seeds.touching)
     fixed = replace(task, new=(contact,), fixed=True)
     key = direct.optimise(ik, fixed, solution.q, options)
     return replace(key, method=method)

@@ -135,8 +135,8 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     """
     t = transition
     made = t.held
-    if t.move.makes:
-        made = (*t.held, t.move.makes)
+    if t.step.makes:
+        made = (*t.held, t.step.makes)
     closed = (*t.held, *t.rolling)
     swing, control = _swing(ik, t, adapt)
     phases = (
@@ -204,7 +204,7 @@ def bridge(
 def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
     """Postures from the shifted to the touching one, the surface along its arc."""
     world, kin = ik.world, ik.kin
-    made = t.move.makes
+    made = t.step.makes
     if made is None:
         return bridge(ik, t.shifted, t.touching, t.held, t.held), np.zeros((0, 3))
     kin.update(t.shifted)
@@ -368,7 +368,7 @@ def check_phases(
     """
     kin, world = ik.kin, ik.world
     worst, weak, note = 0.0, "", ""
-    moving = (*t.leaving, t.move.makes) if t.move.makes else t.leaving
+    moving = (*t.leaving, t.step.makes) if t.step.makes else t.leaving
     for phase in phases:
         watched = watched_pairs(world, (*phase.contacts, *moving))
         for a, b in itertools.pairwise(phase.q):

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clamber.contact.contact import Contact
-from clamber.contact.steps import Guide, Move
+from clamber.contact.steps import Seeds, Step
 from clamber.errors import Status
 from clamber.model.world import World
 from clamber.step.ik import (
@@ -43,7 +43,7 @@ class Transition:
     """The postures that move one contact.
 
     Attributes:
-        move: With the contact where it is made.
+        step: With the contact where it is made.
         before, after: Configurations (nq,) of the keyframes.
         shifted: (nq,) all old contacts closed, weight on those that stay.
         touching: (nq,) the new contact closed, not loaded.
@@ -56,7 +56,7 @@ class Transition:
         note: Which joint cannot.
     """
 
-    move: Move
+    step: Step
     before: np.ndarray
     shifted: np.ndarray
     touching: np.ndarray
@@ -73,7 +73,7 @@ class Transition:
     @property
     def leaving(self) -> tuple[Contact, ...]:
         """Contacts that are broken, as they were."""
-        return tuple(c for c in self.stance if c.surface in self.move.breaks)
+        return tuple(c for c in self.stance if c.surface in self.step.breaks)
 
 
 def reach_to_support(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -171,10 +171,9 @@ def plan_transition(
     ik: IK,
     before: Keyframe,
     after: Keyframe,
-    move: Move,
+    step: Step,
     *,
     margin: float,
-    guide: Guide | None = None,
 ) -> Transition:
     """Shift, touch and settle between two keyframes.
 
@@ -182,14 +181,13 @@ def plan_transition(
         ik: Workspace.
         before: Keyframe it starts from.
         after: Keyframe it leads to.
-        move: What changes between them.
+        step: What changes between them.
         margin: Of the centre of mass to the border of its polygon [m].
-        guide: Where its postures may be found.
     """
-    world, guide = ik.world, guide or Guide()
-    new = move.makes.surface if move.makes is not None else None
+    world = ik.world
+    new = step.makes.surface if step.makes is not None else None
     held = tuple(c for c in after.stance if c.surface != new)
-    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    leaving = tuple(c for c in before.stance if c.surface in step.breaks)
     middle = np.mean([c.position for c in held], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
     shift = ik.solve_hard(
@@ -197,14 +195,16 @@ def plan_transition(
             world, held=held, closed=rolling, q_reference=before.q, margin=margin
         ),
         before.q,
-        hint=guide.shifted,
+        hint=step.seeds.shifted,
     )
     solutions, touching = [shift], after.q
-    if move.makes is not None:
-        made = next(c for c in after.stance if c.surface == move.makes.surface)
-        move = replace(move, makes=made)
+    if step.makes is not None:
+        made = next(c for c in after.stance if c.surface == step.makes.surface)
+        step = replace(step, makes=made)
         if shift.status is Status.SOLVED:
-            touch = _touch(ik, held, made, shift.q, after.q, margin, guide.touching)
+            touch = _touch(
+                ik, held, made, shift.q, after.q, margin, step.seeds.touching
+            )
             solutions.append(touch)
             touching = touch.q
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
@@ -214,7 +214,7 @@ def plan_transition(
         if not holds(ik.kin, held):
             status, note = Status.OVERLOADED, weakness(ik.kin, held)
     return Transition(
-        move=move,
+        step=step,
         before=before.q,
         shifted=shift.q,
         touching=touching,
@@ -259,11 +259,11 @@ def _touch(
 def eased_contacts(
     ik: IK,
     before: Keyframe,
-    move: Move,
+    step: Step,
     surfaces: Collection[str],
     *,
     margin: float = MARGINS[-1],
-) -> tuple[tuple[Contact, ...], Guide] | None:
+) -> tuple[tuple[Contact, ...], Seeds] | None:
     """Where earlier contacts should have been for a move to work.
 
     Solves the move's weight shift with these contacts free on their supports; where
@@ -272,7 +272,7 @@ def eased_contacts(
     Args:
         ik: Workspace.
         before: Keyframe it starts from.
-        move: That does not work.
+        step: That does not work.
         surfaces: Whose contacts are free.
         margin: Of the centre of mass to the border of its polygon [m].
 
@@ -280,9 +280,9 @@ def eased_contacts(
         The contacts at their better places, and the posture found with them; None where
         that does not help either.
     """
-    held = tuple(c for c in before.stance if c.surface not in {*move.breaks, *surfaces})
+    held = tuple(c for c in before.stance if c.surface not in {*step.breaks, *surfaces})
     moved = tuple(c for c in before.stance if c.surface in surfaces)
-    leaving = tuple(c for c in before.stance if c.surface in move.breaks)
+    leaving = tuple(c for c in before.stance if c.surface in step.breaks)
     middle = np.mean([c.position for c in (*held, *moved)], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
     free = tuple(_free_goal(ik, c, 1.0) for c in moved)
@@ -297,8 +297,8 @@ def eased_contacts(
         margin=margin,
     )
     problems = {"shifted": shift}
-    if move.makes is not None:
-        new, at = move.makes, move.makes.position
+    if step.makes is not None:
+        new, at = step.makes, step.makes.position
         problems["touching"] = balance_problem(
             ik.world,
             held=tuple(rolled(ik, before.q, c, at) for c in held),
@@ -317,7 +317,7 @@ def eased_contacts(
             np.linalg.norm(a.position - b.position) > MOVED
             for a, b in zip(eased, moved, strict=True)
         ):
-            return eased, Guide(**{posture: solution.q})
+            return eased, Seeds(**{posture: solution.q})
     return None
 
 

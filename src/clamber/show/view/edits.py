@@ -77,9 +77,9 @@ def spells_of(made: Plan) -> tuple[Spell, ...]:
     """The contacts of a plan's sequence that can be moved: those made on the way."""
     sequence = made.sequence
     planned = {
-        (step.stance, step.move.makes.surface): made.keyframes[i]
+        (step.stance, step.makes.surface): made.keyframes[i]
         for i, step in keyframe_steps(made)
-        if step.move.makes is not None
+        if step.makes is not None
     }
     out = []
     for surface in made.world.surfaces:
@@ -115,7 +115,7 @@ def keyframe_steps(made: Plan) -> list[tuple[int, Step]]:
         before = {c.surface for c in made.keyframes[i - 1].stance}
         new = [c.surface for c in made.keyframes[i].stance if c.surface not in before]
         for j in range(k, len(steps)):
-            makes = steps[j].move.makes
+            makes = steps[j].makes
             if (None if makes is None else makes.surface) in (new or [None]):
                 out.append((i, steps[j]))
                 k = j + 1
@@ -157,7 +157,7 @@ def edited_sequence(made: Plan, edits: Edits) -> ContactSequence:
     for index, place in edits.moved.items():
         spell = spells[index]
         support = made.world.supports[spell.contact.support]
-        contact = replace(spell.contact, position=clamped(support, place), firm=True)
+        contact = replace(spell.contact, position=clamped(support, place), fixed=True)
         for i in range(spell.first, spell.last):
             stances[i] = replace(
                 stances[i],
