@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import clamber
-from clamber.show.viz import finish_axes, save_plot
+from clamber.show.plots import finish_axes, save_plot
 
 LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 HEIGHT, WIDTH, FACE, BEYOND = 0.27, 0.8, 0.23, 0.45  # [m]

@@ -709,15 +709,16 @@ def drawn(monkeypatch: pytest.MonkeyPatch, stages: SimpleNamespace) -> list[tupl
     """What is asked of the drawing functions, which draw nothing."""
     asked: list[tuple] = []
 
-    def note(name: str) -> None:
+    def note(name: str, home: str) -> None:
         def draw(*args: object, **options: object) -> Path:
             asked.append((name, args, options))
             return Path("there.png")
 
-        monkeypatch.setattr(f"clamber.show.viz.{name}", draw)
+        monkeypatch.setattr(f"clamber.show.{home}.{name}", draw)
 
-    for name in ("render_frame", "keyframe_sheet", "video"):
-        note(name)
+    note("render_frame", "pictures")
+    note("keyframe_sheet", "pictures")
+    note("video", "renderer")
     monkeypatch.setitem(vars(clamber), "load_rollout", lambda folder: "rollout")
     return asked
 

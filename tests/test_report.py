@@ -23,8 +23,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.records import Plan
 from clamber.run import folder as io
-from clamber.show import report, viz
-from clamber.show import sample as motion
+from clamber.show import report
 
 NASTY = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>"
 
@@ -88,44 +87,6 @@ def test_packed_numbers_are_off_by_half_a_step_at_most(rng: np.random.Generator)
     assert not unpacked(report.packed(np.zeros((3, 2)))).any()
 
 
-def test_no_peak_is_lost_between_samples(rng: np.random.Generator):
-    x = rng.normal(size=(100, 3))
-    rows = np.array([0, 7, 30, 99])
-    peaks = motion.peaks(x, rows)
-    for i, (a, b) in enumerate([(0, 7), (7, 30), (30, 99), (99, 100)]):
-        for j in range(3):
-            part = x[a:b, j]
-            assert peaks[i, j] == part[np.abs(part).argmax()]
-
-
-def test_rows_are_even_keep_the_end_and_fit():
-    t = np.arange(1001) * 0.01
-    rows = motion.even_rows(t, 10_000)
-    assert rows[0] == 0
-    assert rows[-1] == 1000
-    assert len(rows) == 251
-    assert len(motion.even_rows(t, 20)) <= 21
-    assert motion.even_rows(t[:1], 20).tolist() == [0]
-
-
-def test_short_gaps_and_touches_are_none(rollout: Rollout):
-    force = np.zeros_like(rollout.contact_force)
-    force[10:60, 0, 2] = 100.0
-    force[30:34, 0, 2] = 0.0  # 40 ms without
-    force[20:40, 1, 2] = 100.0
-    force[50:53, 1, 2] = 100.0  # 30 ms with
-    force[70:80, 2, 2] = 100.0
-    force[90:99, 2, 2] = 100.0  # after 100 ms
-    force[2:9, 3, 2] = 100.0  # all but from the beginning
-    force[0:3, 4, 2] = 100.0  # no longer than that
-    force[8:20, 5, 2] = 100.0  # later
-    steady = motion.steadily_loaded(replace(rollout, contact_force=force))
-    runs = [viz.runs_of(column) for column in steady.T]
-    assert runs[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
-    assert runs[3:6] == [[(0, 9)], [(0, 3)], [(8, 20)]]
-    assert not any(runs[6:])
-
-
 def test_poses_are_those_of_the_recorded_states(whole: Path, rollout: Rollout):
     record = report.run_record(whole)
     motion, t = record["motion"], times(record)
@@ -184,45 +145,6 @@ def test_the_last_stability_is_that_of_the_last_keyframe(whole: Path, plan: Plan
     assert np.isfinite(series(record, "ratio")[planned, j]).all()
     lifted = series(record, "points")[:, 3 * j + 2]
     assert lifted[-1] == pytest.approx(0.25, abs=0.01)
-
-
-# When keyframes are reached.
-
-
-def test_keyframes_are_reached_when_the_plan_says(plan: Plan, rollout: Rollout):
-    assert plan.trajectory is not None
-    assert motion.keyframe_times(plan, rollout) == plan.trajectory.keyframes.tolist()
-    early = replace(rollout, time=rollout.time * 0.5)
-    assert motion.keyframe_times(plan, early) == [0.0, None]
-    bare = replace(plan, trajectory=None)
-    assert motion.keyframe_times(bare, None) == [0.0, 1.0]
-
-
-def test_keyframes_of_an_adapted_run_are_found_by_their_contacts(
-    plan: Plan, rollout: Rollout
-):
-    first = plan.trajectory
-    assert first is not None
-    wait = 400  # samples that the robot stood still before it began
-
-    def later(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.repeat(x[:1], wait, axis=0), x])
-
-    followed = replace(
-        first,
-        time=np.arange(len(first.time) + wait) * 0.001,
-        q=later(first.q),
-        v=later(first.v),
-        tau=later(first.tau),
-        contact=later(first.contact),
-        keyframes=np.zeros(1),
-    )
-    adapted = replace(rollout, followed=followed, time=rollout.time + 0.4)
-    start, hand = motion.keyframe_times(plan, adapted)
-    assert start == pytest.approx(0.0, abs=0.5)
-    assert hand == pytest.approx(first.keyframes[1] + 0.4, abs=0.3)
-    never = replace(followed, contact=np.zeros_like(followed.contact))
-    assert motion.keyframe_times(plan, replace(adapted, followed=never)) == [None] * 2
 
 
 # The file.

@@ -17,12 +17,13 @@ import clamber
 from clamber.contact.contact import ContactSequence
 from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
+from clamber.show.pictures import PHASE_COLOURS
+from clamber.show.renderer import frame_view
 from clamber.show.sample import stance_rows
 from clamber.show.view import charts
 from clamber.show.view.charts import Line
 from clamber.show.view.person import Person, show_person
 from clamber.show.view.shown import Shown, frame_at, show_run
-from clamber.show.viz import PHASE_COLOURS, frame_view
 
 TIME = np.linspace(0.0, 8.0, 801)
 

@@ -20,6 +20,8 @@ from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
+from clamber.show.pictures import PHASE_COLOURS
+from clamber.show.sample import bearing_of
 from clamber.show.view import edits
 from clamber.show.view.person import beside, change_times, figure_at, show_person
 from clamber.show.view.shown import (
@@ -39,7 +41,6 @@ from clamber.show.view.shown import (
     way_at,
     weight_of,
 )
-from clamber.show.viz import PHASE_COLOURS, bearing_of
 from clamber.step.statics import support_ellipse
 
 UP = np.array([0.0, 0.0, 1.0])

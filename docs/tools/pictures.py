@@ -18,7 +18,9 @@ from matplotlib.patches import Ellipse, Polygon, Rectangle
 import clamber
 from clamber.execution.terrain import fitted_box
 from clamber.model.kinematics import Kinematics
-from clamber.show.viz import Camera, finish_axes, mark_keyframe, save_plot, view_of
+from clamber.show.pictures import mark_keyframe
+from clamber.show.plots import finish_axes, save_plot
+from clamber.show.renderer import Camera, view_of
 from clamber.step.statics import support_ellipse, support_polygon
 
 mpl.rcParams.update({"font.size": 9, "axes.titlesize": 9, "savefig.dpi": 110})

@@ -531,7 +531,7 @@ class LearnCommand:
     def run(self) -> int:
         """Demonstrations to a policy."""
         from clamber.run.folder import POLICY, policy_summary
-        from clamber.show.policy_plots import save_pictures
+        from clamber.show.plots import save_pictures
 
         if not self.demonstrations:
             raise InputError("no demonstration: name at least one, such as crossing")
@@ -631,7 +631,7 @@ class RenderCommand:
     def _draw(self, report: Report) -> list[Path]:
         if not (self.video or self.sheet or self.frame is not None):
             return clamber.render_run(self.run_folder, report=report)
-        from clamber.show import viz
+        from clamber.show import pictures, renderer
 
         size = None if self.size is None else _picture_size(self.size)
         given: dict[str, Any] = {"camera": self.camera}
@@ -639,17 +639,17 @@ class RenderCommand:
             if self.frame is not None:
                 given |= {"out": self.out, "transparent": self.transparent}
                 given |= {} if size is None else {"size": size}
-                return [viz.render_frame(self.run_folder, self.frame, **given)]
+                return [pictures.render_frame(self.run_folder, self.frame, **given)]
             plan = clamber.load_plan(self.run_folder)
             if self.sheet:
                 path = self.out or self.run_folder / "keyframes.png"
                 if path.suffix != ".png":
                     raise InputError("a name that ends in .png", source=path)
                 given |= {} if size is None else {"tile": size}
-                return [viz.keyframe_sheet(plan, path, **given)]
+                return [pictures.keyframe_sheet(plan, path, **given)]
             rollout = clamber.load_rollout(self.run_folder)
             given |= {"out": self.out, "size": size, "report": report}
-            return [viz.video(plan, rollout, self.run_folder, **given)]
+            return [renderer.video(plan, rollout, self.run_folder, **given)]
         except OSError as e:
             raise InputError(
                 f"a file that can be written ({e.strerror or e})",

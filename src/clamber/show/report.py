@@ -37,15 +37,15 @@ from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
 from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, whole_file
 from clamber.show.meshes import Mesh, body_meshes, body_poses
+from clamber.show.pictures import FORCE_LENGTH
+from clamber.show.renderer import PRESETS, seen_points
 from clamber.show.sample import (
     Reading,
     keyframe_times,
     read_run,
     sample_motion,
-    seen_points,
     stance_rows,
 )
-from clamber.show.viz import FORCE_LENGTH, PRESETS
 
 REPORT = "report.html"
 PERSON = "demonstration.png"  # of the recording, which is not in the folder
@@ -262,7 +262,7 @@ def _motion(
         "base": None if m.push is None else m.q[:, :3],
         "points": m.points,
         "support": m.support,
-        "ratio": m.ratio,
+        "ratio": m.distance / m.limit,
         "margin": m.margin,
         "plannedMargin": m.planned_margin,
         "error": m.error,

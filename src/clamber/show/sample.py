@@ -9,7 +9,7 @@ Shapes: n samples, nq coordinates, nS surfaces, na joints, M recorded states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -21,9 +21,10 @@ from clamber.contact.contact import Contact
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
+from clamber.model.scene import Support
 from clamber.model.world import World
 from clamber.planning.records import Plan
-from clamber.planning.trajectory import Trajectory
+from clamber.planning.trajectory import Samples, Trajectory
 from clamber.run.folder import (
     EXECUTION,
     PLAN,
@@ -37,19 +38,19 @@ from clamber.run.folder import (
     load_plan,
     load_rollout,
 )
-from clamber.show.viz import (
-    describe_move,
-    loaded_surfaces,
-    near_edge_points,
-    robot_corners,
-    runs_of,
-    stability_of,
-    support_below,
+from clamber.step.statics import (
+    com_margin,
+    projected_distance,
+    support_polygon,
+    theta_max,
 )
 
 SAMPLES_A_SECOND = 25
 SAME_POSTURE = 1e-3  # [rad]
 SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
+LOADED = 0.01  # [weights] a surface that bears more is loaded
+TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
+MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
 _Loaded = TypeVar("_Loaded")
 
 
@@ -156,6 +157,29 @@ def read_run(folder: Path) -> Run:
 # Stances.
 
 
+def changed(
+    before: Sequence[Contact], after: Sequence[Contact]
+) -> tuple[list[Contact], list[str]]:
+    """Contacts that a stance makes anew, and surfaces that leave theirs."""
+    was = {c.surface: c.position for c in before}
+    made = [
+        c
+        for c in after
+        if c.surface not in was or np.linalg.norm(c.position - was[c.surface]) > MOVED
+    ]
+    now = {c.surface for c in after}
+    return made, [s for s in was if s not in now]
+
+
+def describe_change(before: Sequence[Contact], after: Sequence[Contact]) -> str:
+    """What changed between two stances, such as `LElbow on box for LHand`."""
+    made, broken = changed(before, after)
+    if made:
+        text = ", ".join(f"{c.surface} on {c.support}" for c in made)
+        return f"{text} for {', '.join(broken)}" if broken else text
+    return f"{', '.join(broken)} in the air" if broken else "no change"
+
+
 def stance_rows(
     written: Mapping[str, Any], times: list[float | None]
 ) -> list[dict[str, Any]]:
@@ -177,7 +201,7 @@ def stance_rows(
             for c in key["contacts"]
         ]
         on = ", ".join(c.surface for c in stance)
-        move = f"start, on {on}" if before is None else describe_move(before, stance)
+        move = f"start, on {on}" if before is None else describe_change(before, stance)
         before = stance
         e = key["static_equilibrium"]
         force = _force_by_surface(e)
@@ -270,7 +294,8 @@ class Motion:
         points: (n, nS, 3) lowest points of the surfaces [m]; support: (n, nS) index of
             the support below, in the order of `world.supports`.
         planned: (n, nS) bool, contacts of the reference; loaded: what bears in physics.
-        ratio: (n, nS) projected distance over its limit, of what is planned or bears.
+        distance, limit: (n, nS) projected distances (4.17) of what is planned or bears,
+            and l sin(theta_max) in that posture [m]; NaN elsewhere.
         margin: (n,) of the centre of mass [m]; planned_margin: of the reference.
         error: (n, 3) largest and root mean square joint error [rad], of the base [m].
         force: (n, nS, 3) [N] in the world.
@@ -294,7 +319,8 @@ class Motion:
     support: np.ndarray
     planned: np.ndarray | None
     loaded: np.ndarray | None = None
-    ratio: np.ndarray
+    distance: np.ndarray
+    limit: np.ndarray
     margin: np.ndarray
     planned_margin: np.ndarray | None = None
     error: np.ndarray | None = None
@@ -344,18 +370,15 @@ def sample_motion(
         q = np.array([k.q for k in plan.keyframes])
         held = [{c.surface for c in k.stance} for k in plan.keyframes]
         series = {"planned": np.array([[s in h for s in world.surfaces] for h in held])}
-    kin = Kinematics(world)
-    points, support = surface_points(world, kin, q)
     planned, bears = series["planned"], series.get("loaded")
     bears = planned if bears is None else bears
     marked = bears if planned is None else bears | planned
-    names = tuple(world.surfaces)
-    d, limit, margin = stability_of(world, q, marked, names)
-    other = np.any(marked != bears, axis=1)  # what bears nothing holds no CoM
-    margin[other] = stability_of(world, q[other], bears[other], names)[2]
+    series |= stability_of(world, q, marked, bears)
     q_ref = series.get("reference")
     if q_ref is not None and planned is not None:
-        series["planned_margin"] = stability_of(world, q_ref, planned, names)[2]
+        series["planned_margin"] = stability_of(world, q_ref, planned, planned)[
+            "margin"
+        ]
         series["error"] = _errors(world, q, q_ref)
     end = float(time[-1])
     schedule = [] if reference is None else spells(reference.time, reference.contact)
@@ -366,10 +389,6 @@ def sample_motion(
         stills=rollout is None and reference is None,
         time=time,
         q=q,
-        points=points,
-        support=support,
-        ratio=d / limit,
-        margin=margin,
         schedule=schedule or [[] for _ in world.surfaces],
         loads=loads,
         events=sorted({round(t, 3) for t in switches if SHORTEST_LOAD < t < end}),
@@ -429,20 +448,59 @@ def peaks(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.where(high >= -low, high, low)
 
 
-def surface_points(
-    world: World, kin: Kinematics, q: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest points (n, nS, 3) [m] of the surfaces, index (n, nS) of supports below."""
-    names = list(world.supports)
-    points = np.zeros((len(q), len(world.surfaces), 3))
-    support = np.zeros((len(q), len(world.surfaces)), dtype=int)
-    for i, posture in enumerate(q):
-        kin.update(posture)
+def stability_of(
+    world: World, postures: np.ndarray, marked: np.ndarray, bears: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Geometric stability (4.17) of postures (n, nq): fields of a `Motion`.
+
+    Args:
+        world: Robot and supports.
+        postures: (n, nq).
+        marked: (n, nS) bool, surfaces of which the distances are wanted.
+        bears: (n, nS) bool, surfaces on which the centre of mass is held.
+    """
+    kin, supports = Kinematics(world), list(world.supports)
+    n, count = marked.shape
+    points, support = np.zeros((n, count, 3)), np.zeros((n, count), dtype=int)
+    d, limit = np.full((n, count), np.nan), np.full((n, count), np.nan)
+    margin = np.full(n, np.nan)
+    for i, q in enumerate(postures):
+        kin.update(q)
+        bearing = []
         for j, surface in enumerate(world.surfaces):
             below = support_below(world, kin, surface)
-            points[i, j] = kin.contact_point(surface, below.normal)
-            support[i, j] = names.index(below.name)
-    return points, support
+            points[i, j] = point = kin.contact_point(surface, below.normal)
+            support[i, j] = supports.index(below.name)
+            if marked[i, j]:
+                mass = kin.landmark(world.robot.limb_of(surface).root)[1]
+                d[i, j] = projected_distance(point, mass)
+                length = float(np.linalg.norm(mass - point))
+                limit[i, j] = length * math.sin(theta_max(below.friction))
+            if bears[i, j]:
+                bearing.append(bearing_of(kin, surface, below))
+        if bearing:
+            polygon = support_polygon(np.concatenate(bearing)[:, :2])
+            margin[i] = com_margin(kin.com, polygon)
+    names = ("points", "support", "distance", "limit", "margin")
+    return dict(zip(names, (points, support, d, limit, margin), strict=True))
+
+
+def bearing_of(kin: Kinematics, surface: str, support: Support) -> np.ndarray:
+    """(k, 3) points of a surface that bear on a support; the nearest one at least."""
+    points = kin.bearing_points(surface, support.normal)
+    gaps = support.height(points)
+    return points[gaps <= max(TOUCHING, float(gaps.min()))]
+
+
+def support_below(world: World, kin: Kinematics, surface: str) -> Support:
+    """The support that a surface is nearest to at the present posture."""
+
+    def gap(s: Support) -> float:
+        point = kin.contact_point(surface, s.normal)
+        outside = 0.0 if s.inside(point, -0.05) else math.inf
+        return abs(float(s.height(point))) + outside
+
+    return min(world.supports.values(), key=gap)
 
 
 def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> np.ndarray:
@@ -459,7 +517,8 @@ def steadily_loaded(rollout: Rollout) -> np.ndarray:
     A stiff contact that rolls is without force for a step now and then; one in which
     the run begins, until it has been pressed.
     """
-    loaded = loaded_surfaces(rollout.world, rollout)
+    force = np.linalg.norm(rollout.contact_force, axis=2)
+    loaded = force > LOADED * rollout.world.mass * 9.81
     last = len(rollout.time) - 1
     step = float(rollout.time[-1] - rollout.time[0]) / max(last, 1)
     for column in loaded.T:
@@ -479,17 +538,17 @@ def spells(time: np.ndarray, contact: np.ndarray) -> list[list[tuple[float, floa
     ]
 
 
-def seen_points(kin: Kinematics, q: np.ndarray) -> np.ndarray:
-    """(m, 3) points that a camera has to have in view [m].
+def runs_of(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Half-open ranges in which a boolean (M,) mask is true."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return list(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
 
-    They are the corners of boxes around some of the postures (n, nq), and the near
-    edge.
-    """
-    corners = []
-    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    for posture in q[np.unique(np.linspace(0, len(q) - 1, 40).astype(int))]:
-        kin.update(posture)
-        points = robot_corners(kin)
-        low, high = points.min(axis=0), points.max(axis=0)
-        corners.append(low + sides * (high - low))
-    return np.concatenate([*corners, near_edge_points(kin.world.scene)]).round(3)
+
+def row_at(times: np.ndarray, t: float) -> int:
+    """Index of the last of rising times (n,) up to `t` [s]; 0 before the first."""
+    return max(0, int(np.searchsorted(times, t + 1e-9, side="right")) - 1)
+
+
+def thinned(x: np.ndarray | Samples, n: int) -> np.ndarray:
+    """About `n` rows, evenly spaced, the last one among them."""
+    return x[np.unique(np.linspace(0, len(x) - 1, min(n, len(x))).round().astype(int))]

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from clamber.run.folder import whole_file
-from clamber.show.viz import finish_axes, save_plot
+from clamber.show.plots import finish_axes, save_plot
 from clamber.study.climb import Outcome
 from clamber.study.spec import Spec, Strand, strands
 from clamber.study.statistics import Break, fit_break, wilson

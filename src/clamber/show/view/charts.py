@@ -20,10 +20,10 @@ import numpy as np
 
 from clamber.contact.contact import PARTS, ContactSequence, Stance
 from clamber.recording.demonstration import SIDES
-from clamber.show.sample import Motion, peaks
+from clamber.show.pictures import PHASE_COLOURS
+from clamber.show.sample import Motion, peaks, row_at
 from clamber.show.view.person import Person
 from clamber.show.view.shown import Frame, Shown
-from clamber.show.viz import PHASE_COLOURS, row_at
 
 GO_TO = "go to [s]"  # the field; a time after `@` is one that was clicked
 CLICKED = "@"

@@ -20,8 +20,8 @@ import numpy as np
 import viser
 
 from clamber.errors import InputError
+from clamber.show.renderer import PRESETS, Preset, View, frame_view
 from clamber.show.view import charts
-from clamber.show.viz import PRESETS, Preset, View, frame_view
 
 FRAMES_A_SECOND = 45  # so that a browser that draws 30 has a new one for each
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")

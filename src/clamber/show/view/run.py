@@ -17,7 +17,8 @@ from clamber.model.se3 import quat_from_matrix
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
 from clamber.run.folder import verdict_fields
-from clamber.show.sample import Run, seen_points
+from clamber.show.renderer import seen_points
+from clamber.show.sample import Run
 from clamber.show.view import charts
 from clamber.show.view.edits import (
     Edits,

@@ -20,15 +20,18 @@ from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
 from clamber.run.folder import keyframe_fields
 from clamber.show.meshes import Mesh, body_meshes, body_poses
+from clamber.show.pictures import FORCE_LENGTH
 from clamber.show.sample import (
     Motion,
+    bearing_of,
     keyframe_times,
+    row_at,
     sample_motion,
     stance_rows,
     steadily_loaded,
+    support_below,
 )
 from clamber.show.view.edits import keyframe_steps
-from clamber.show.viz import FORCE_LENGTH, bearing_of, row_at, support_below
 from clamber.step.posture import CLEARANCE
 from clamber.step.statics import (
     GRAVITY,

@@ -26,6 +26,7 @@ from clamber.model.se3 import (
 )
 from clamber.model.world import World
 from clamber.show.meshes import Mesh
+from clamber.show.pictures import PHASE_COLOURS
 from clamber.show.view.person import Figure, Person
 from clamber.show.view.shown import (
     ELLIPSE_POINTS,
@@ -38,7 +39,6 @@ from clamber.show.view.shown import (
     tube,
     way_at,
 )
-from clamber.show.viz import PHASE_COLOURS
 
 GHOST = (59, 130, 246)
 PUSH = (162, 28, 175)

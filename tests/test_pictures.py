@@ -15,33 +15,31 @@ import pytest
 from PIL import Image
 
 import clamber
-from clamber.contact.contact import ContactInterval, ContactSequence, Stance
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
-from clamber.model.robot import Robot
-from clamber.model.scene import Box, Scene
+from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.run import folder as io
-from clamber.show import viz
-from conftest import contact
+from clamber.show import pictures, renderer
+from clamber.show.sample import thinned
 
 SIZE = (160, 120)
 
 
 @pytest.fixture(scope="module")
-def plan(one_hand: ContactSequence, coman: Robot) -> Plan:
-    return clamber.plan(one_hand, coman, one_hand.scene)
+def plan(one_hand_plan: Plan) -> Plan:
+    return one_hand_plan
 
 
 @pytest.fixture(scope="module")
-def rollout(plan: Plan) -> Rollout:
-    return clamber.simulate(plan)
+def rollout(one_hand_rollout: Rollout) -> Rollout:
+    return one_hand_rollout
 
 
 @pytest.fixture
-def pictures() -> None:
-    if viz.gl_backend() is None:
+def opengl() -> None:
+    if renderer.gl_backend() is None:
         pytest.skip("no OpenGL here")
 
 
@@ -59,21 +57,21 @@ def test_the_nearest_view_has_every_point_in_and_one_on_the_border(
     aspect: float, yaw: float, rng: np.random.Generator
 ):
     points = rng.uniform(-1, 1, (50, 3)) * [0.4, 0.3, 0.9] + [3.0, -2.0, 0.5]
-    view = viz.frame_view(points, aspect, yaw=yaw)
+    view = renderer.frame_view(points, aspect, yaw=yaw)
     size = (round(1000 * aspect), 1000)
     seen = view.project(points, size)
-    free = viz.MARGIN / 2 * np.array(size)
+    free = renderer.MARGIN / 2 * np.array(size)
     off = np.abs(seen - np.array(size) / 2) / (np.array(size) / 2 - free)
     assert off.max() == pytest.approx(1.0, abs=2e-3)
 
 
-def test_points_are_drawn_where_the_projection_says(plan: Plan, pictures: None):
+def test_points_are_drawn_where_the_projection_says(plan: Plan, opengl: None):
     size = (320, 240)
     world = plan.world
-    view = viz.view_of(world, [world.home], size[0] / size[1])
+    view = renderer.view_of(world, [world.home], size[0] / size[1])
     kin = Kinematics(world)
     kin.update(world.home)
-    with viz.Camera(world, size) as camera:
+    with renderer.Camera(world, size) as camera:
         picture = np.asarray(camera.shot(world.home, view)).astype(int)
     x, y = view.project(kin.point(*foot_of(plan)), size).round().astype(int)
     r, g, b = picture[y, x]  # the feet are orange
@@ -88,57 +86,45 @@ def foot_of(plan: Plan) -> tuple[int, np.ndarray]:
 
 def test_the_whole_robot_is_in_view_in_every_posture(plan: Plan, rollout: Rollout):
     postures = rollout.qpos[::50]
-    view = viz.view_of(plan.world, postures, 4 / 3)
+    view = renderer.view_of(plan.world, postures, 4 / 3)
     kin = Kinematics(plan.world)
     for q in postures:
         kin.update(q)
-        seen = view.project(viz.robot_corners(kin), (640, 480))
+        seen = view.project(renderer.robot_corners(kin), (640, 480))
         assert np.all(seen > 0)
         assert np.all(seen < [640, 480])
 
 
 def test_the_near_edge_is_the_one_before_the_start():
     scene = Scene.from_height(0.3)
-    edge = viz.near_edge_points(scene)
+    edge = renderer.near_edge_points(scene)
     np.testing.assert_allclose(edge[:, 0], 0.23)
     np.testing.assert_allclose(sorted(set(edge[:, 2].round(9))), [0.0, 0.3])
-    np.testing.assert_allclose(np.abs(edge[:, 1]), viz.EDGE_SHOWN)
+    np.testing.assert_allclose(np.abs(edge[:, 1]), renderer.EDGE_SHOWN)
     left = replace(scene, start=np.array([0.73, -2.0, 0.0]))
-    np.testing.assert_allclose(viz.near_edge_points(left)[:, 1], -0.6)
+    np.testing.assert_allclose(renderer.near_edge_points(left)[:, 1], -0.6)
     nothing = Scene(start=np.zeros(3))
-    assert viz.near_edge_points(nothing).shape == (0, 3)
+    assert renderer.near_edge_points(nothing).shape == (0, 3)
 
 
 # Words.
 
 
-def test_moves_are_described_by_what_changed():
-    feet = [contact("LFoot", "ground", 0, 0, 0), contact("RFoot", "ground", 0, 0, 0)]
-    hand = contact("LHand", "box", 0.4, 0.1, 0.2)
-    elbow = contact("LElbow", "box", 0.4, 0.1, 0.2)
-    moved = replace(hand, position=np.array([0.5, 0.1, 0.2]))
-    assert viz.describe_move(feet, [*feet, hand]) == "LHand on box"
-    assert viz.describe_move([*feet, hand], [*feet, elbow]) == "LElbow on box for LHand"
-    assert viz.describe_move([*feet, hand], [*feet, moved]) == "LHand on box"
-    assert viz.describe_move([*feet, hand], feet) == "LHand in the air"
-    assert viz.describe_move(feet, feet) == "no change"
-
-
 def test_a_caption_gives_the_figures_of_the_keyframe(plan: Plan):
     first, last = plan.keyframes[0], plan.keyframes[-1]
-    title, geometry, balance = viz.keyframe_caption(1, last, first)
+    title, geometry, balance = pictures.keyframe_caption(1, last, first)
     assert title == "1  LHand on box"
     d = next(c for c in last.contacts if c.contact.surface == "LHand")
     assert f"d LHand {1000 * d.projected_distance:.0f} mm" in geometry
     assert f"CoM margin {1000 * last.com_margin:.0f} mm" in geometry
     assert f"{last.equilibrium.margin:.2f} weights" in balance
     assert str(last.equilibrium.limiting) in balance
-    assert viz.keyframe_caption(0, first, None)[0] == "0  start, on LFoot, RFoot"
+    assert pictures.keyframe_caption(0, first, None)[0] == "0  start, on LFoot, RFoot"
 
 
 def test_forces_of_the_contacts_carry_the_weight(plan: Plan):
     for key in plan.keyframes:
-        total = np.sum(viz._force_by_contact(plan.world, key), axis=0)
+        total = np.sum(pictures._force_by_contact(plan.world, key), axis=0)
         weight = [0.0, 0.0, plan.world.mass * 9.81]
         np.testing.assert_allclose(total, weight, atol=0.5)
 
@@ -147,59 +133,20 @@ def test_forces_of_the_contacts_carry_the_weight(plan: Plan):
     ("seconds", "speedup"), [(3.0, 1), (12.0, 1), (14.0, 1), (46.0, 4), (270.0, 32)]
 )
 def test_long_runs_are_shown_faster_by_a_power_of_two(seconds: float, speedup: int):
-    assert viz.speedup_of(seconds) == speedup
-    assert seconds / speedup <= viz.VIDEO_SECONDS
-
-
-# Figures over time.
-
-
-def test_the_figures_at_the_end_are_those_of_the_last_keyframe(
-    plan: Plan, rollout: Rollout
-):
-    rows = np.array([len(rollout.time) - 1])
-    d, limit, margin = viz.stability_over_time(plan.world, rollout, rows)
-    key = plan.keyframes[-1]
-    loaded = {s for s, x in zip(rollout.surfaces, d[0], strict=True) if np.isfinite(x)}
-    assert loaded == {c.contact.surface for c in key.contacts}
-    for c in key.contacts:
-        j = rollout.surfaces.index(c.contact.surface)
-        assert d[0, j] == pytest.approx(c.projected_distance, abs=0.015)
-        assert (d[0, j] <= limit[0, j]) == (c.phase == "supporting")
-    assert margin[0] == pytest.approx(key.com_margin, abs=0.015)
-
-
-def test_nothing_loaded_has_no_margin(plan: Plan, rollout: Rollout):
-    flying = replace(rollout, contact_force=np.zeros_like(rollout.contact_force))
-    d, limit, margin = viz.stability_over_time(plan.world, flying, np.array([0, 5]))
-    assert np.isnan(d).all()
-    assert np.isnan(limit).all()
-    assert np.isnan(margin).all()
-
-
-def test_a_surface_stands_on_the_support_below_it(plan: Plan, rollout: Rollout):
-    kin = Kinematics(plan.world)
-    kin.update(rollout.qpos[-1])
-    assert viz.support_below(plan.world, kin, "LHand").name == "box"
-    assert viz.support_below(plan.world, kin, "RFoot").name == "ground"
-
-
-def test_contact_in_the_plot_begins_and_ends_with_the_load():
-    mask = np.array([1, 1, 0, 0, 1, 0, 1], dtype=bool)
-    assert viz.runs_of(mask) == [(0, 2), (4, 5), (6, 7)]
-    assert viz.runs_of(np.zeros(3, dtype=bool)) == []
+    assert renderer.speedup_of(seconds) == speedup
+    assert seconds / speedup <= renderer.VIDEO_SECONDS
 
 
 # Files.
 
 
 def test_a_run_is_drawn_whole_and_twice_the_same(
-    plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
+    plan: Plan, rollout: Rollout, tmp_path: Path, opengl: None
 ):
     io.save_plan(plan, tmp_path)
     io.save_rollout(plan, rollout, tmp_path)
     told: list[tuple[str, float]] = []
-    files = viz.render_run(
+    files = pictures.render_run(
         tmp_path,
         with_video=False,
         report=lambda s, share, note: told.append((s, share)),
@@ -213,23 +160,23 @@ def test_a_run_is_drawn_whole_and_twice_the_same(
     for f in files:
         assert pixels(f).std() > 10, f
     before = {f: f.read_bytes() for f in files}
-    viz.render_run(tmp_path, with_video=False)
+    pictures.render_run(tmp_path, with_video=False)
     assert {f: f.read_bytes() for f in files} == before
 
 
 def test_a_plan_alone_shows_its_keyframes_with_their_contacts(
-    plan: Plan, tmp_path: Path, pictures: None
+    plan: Plan, tmp_path: Path, opengl: None
 ):
     io.save_plan(plan, tmp_path)
-    assert [f.name for f in viz.render_run(tmp_path)] == ["keyframes.png"]
-    green = viz.PHASE_COLOURS["supporting"]
+    assert [f.name for f in pictures.render_run(tmp_path)] == ["keyframes.png"]
+    green = pictures.PHASE_COLOURS["supporting"]
     sheet = pixels(tmp_path / "keyframes.png")
     assert np.all(sheet == green, axis=2).sum() > 100
 
 
-def test_the_picture_of_another_posture_differs(plan: Plan, pictures: None):
-    view = viz.view_of(plan.world, [k.q for k in plan.keyframes], 4 / 3)
-    with viz.Camera(plan.world, SIZE) as camera:
+def test_the_picture_of_another_posture_differs(plan: Plan, opengl: None):
+    view = renderer.view_of(plan.world, [k.q for k in plan.keyframes], 4 / 3)
+    with renderer.Camera(plan.world, SIZE) as camera:
         a, b, c = (
             np.asarray(camera.shot(plan.keyframes[i].q, view)) for i in (0, -1, 0)
         )
@@ -250,15 +197,15 @@ def short(rollout: Rollout) -> Rollout:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_video_has_as_many_pictures_as_its_length_asks(
-    plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
+    plan: Plan, rollout: Rollout, tmp_path: Path, opengl: None
 ):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    path = viz.video(plan, short(rollout), tmp_path)
+    path = renderer.video(plan, short(rollout), tmp_path)
     assert path.name == "video.mp4"
     frames = ffmpeg.read_frames(str(path))
     about = next(frames)
-    assert about["size"] == viz.VIDEO_SIZE
-    assert about["fps"] == viz.FPS
+    assert about["size"] == renderer.VIDEO_SIZE
+    assert about["fps"] == renderer.FPS
     assert len(list(frames)) == 10
     assert len(path.read_bytes()) > 1000
 
@@ -267,11 +214,11 @@ def test_without_ffmpeg_the_video_is_a_webp(
     plan: Plan,
     rollout: Rollout,
     tmp_path: Path,
-    pictures: None,
+    opengl: None,
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    path = viz.video(plan, short(rollout), tmp_path)
+    path = renderer.video(plan, short(rollout), tmp_path)
     assert path.name == "video.webp"
     with Image.open(path) as picture:
         assert picture.n_frames == 5
@@ -283,19 +230,19 @@ def test_without_opengl_plots_are_drawn_and_the_reason_is_one_sentence(
 ):
     io.save_plan(plan, tmp_path)
     io.save_rollout(plan, rollout, tmp_path)
-    monkeypatch.setattr(viz, "gl_backend", lambda: None)
+    monkeypatch.setattr(renderer, "gl_backend", lambda: None)
     with pytest.raises(ClamberError, match="apt-get install libegl1") as e:
-        viz.render_run(tmp_path)
+        pictures.render_run(tmp_path)
     assert "\n" not in str(e.value)
     drawn = {p.name for p in tmp_path.glob("*.png")}
     assert drawn == {"contacts.png", "stability.png"}
 
 
 def test_a_backend_that_does_not_work_is_not_chosen(monkeypatch: pytest.MonkeyPatch):
-    viz.gl_backend.cache_clear()
+    renderer.gl_backend.cache_clear()
     monkeypatch.setenv("MUJOCO_GL", "off")
-    assert viz.gl_backend() is None
-    viz.gl_backend.cache_clear()
+    assert renderer.gl_backend() is None
+    renderer.gl_backend.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -314,84 +261,24 @@ def test_what_does_without_a_broken_file_is_drawn_before_that_is_named(
     plan: Plan,
     rollout: Rollout,
     tmp_path: Path,
-    pictures: None,
+    opengl: None,
 ):
     io.save_plan(plan, tmp_path)
     io.save_rollout(plan, rollout, tmp_path)
     io.save_timings(tmp_path, {"plan": 1.0})
     (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:cut])
     with pytest.raises(InputError, match=name):
-        viz.render_run(tmp_path, with_video=False)
+        pictures.render_run(tmp_path, with_video=False)
     assert drawn <= {p.name for p in tmp_path.glob("*.png")}
 
 
 def test_a_folder_without_a_plan_is_not_drawn(tmp_path: Path):
     with pytest.raises(InputError, match=r"plan\.json: expected a readable file"):
-        viz.render_run(tmp_path)
-
-
-def test_the_demonstration_is_drawn_with_what_was_found(tmp_path: Path):
-    t = np.linspace(0.0, 4.0, 200)
-    names = (*clamber.demo.PARTS, "LShoulder", "RShoulder", "LHip", "RHip", "Pelvis")
-    position = np.zeros((len(t), len(names), 3))
-    position[:, :, 2] = 0.5 + 0.3 * np.sin(t)[:, None] + 0.02 * np.arange(len(names))
-    box = Box(
-        name="table",
-        size=np.ones(3),
-        position=np.array([1, 0, 0.0]),
-        rotation=np.eye(3),
-    )
-    scene = Scene(boxes=(box,), start=np.zeros(3))
-    demo = clamber.Demonstration(
-        source="made up",
-        t=t,
-        names=names,
-        position=position,
-        valid=np.ones(position.shape[:2], dtype=bool),
-        scene=scene,
-        subject={"thigh": 0.4},
-    )
-    hand = contact("LHand", "table", 1.0, 0.1, 0.5)
-    interval = ContactInterval(
-        part="LHand", is_surface=True, t0=1.0, t1=2.0, contact=hand
-    )
-    bare = ContactSequence(
-        source="made up",
-        subject=None,
-        scene=scene,
-        stances=(Stance(contacts=(hand,)),),
-        t=np.array([0.0, 4.0]),
-    )
-    found = replace(bare, intervals=(interval,))
-    a = pixels(viz.demonstration_plot(demo, bare, tmp_path / "a.png"))
-    b = pixels(viz.demonstration_plot(demo, found, tmp_path / "b.png"))
-    changed = np.argwhere(np.any(a != b, axis=2))
-    assert len(changed) > 100
-    height, width, _ = a.shape
-    assert changed[:, 0].max() < height / 2  # the left arm is the first panel
-    assert changed[:, 1].max() < width / 2
-
-
-def test_the_weighted_norm_is_five_times_the_norm(tmp_path: Path):
-    picture = pixels(viz.cost_shapes(tmp_path / "cost.png"))
-
-    def top(colour: tuple[int, int, int]) -> int:
-        """Highest pixel of a curve, its legend at the top centre left out."""
-        found = np.all(np.abs(picture - colour) < 30, axis=2)
-        found[:, picture.shape[1] // 4 : -picture.shape[1] // 4] = False
-        return int(np.argwhere(found)[:, 0].min())
-
-    def bottom() -> int:
-        found = np.all(np.abs(picture - (0x1D, 0x4E, 0xD8)) < 30, axis=2)
-        return int(np.argwhere(found)[:, 0].max())
-
-    low = bottom()
-    ratio = (low - top((0x1D, 0x4E, 0xD8))) / (low - top((0xB9, 0x1C, 0x1C)))
-    assert ratio == pytest.approx(5.0, rel=0.06)
+        pictures.render_run(tmp_path)
 
 
 def test_loading_the_module_changes_no_setting():
-    code = "import os, json; a = dict(os.environ); import clamber.show.viz; "
+    code = "import os, json; a = dict(os.environ); import clamber.show.pictures; "
     code += "print(json.dumps({k: v for k, v in os.environ.items() if a.get(k) != v}))"
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
@@ -404,11 +291,8 @@ def test_loading_the_module_changes_no_setting():
 
 
 @pytest.fixture(scope="module")
-def run(plan: Plan, rollout: Rollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("run")
-    io.save_plan(plan, folder)
-    io.save_rollout(plan, rollout, folder)
-    return folder
+def run(whole: Path) -> Path:
+    return whole
 
 
 @pytest.mark.parametrize(
@@ -420,50 +304,56 @@ def run(plan: Plan, rollout: Rollout, tmp_path_factory: pytest.TempPathFactory) 
         ("top", [0, 0, -1]),
     ],
 )
-def test_cameras_look_from_where_their_name_says(camera: viz.Preset, way: list[float]):
+def test_cameras_look_from_where_their_name_says(
+    camera: renderer.Preset, way: list[float]
+):
     """Of a robot that faces along x; turned with it."""
     points = np.random.default_rng(3).normal(size=(20, 3))
-    forward = viz.frame_view(points, 1.5, camera=camera).axes[2]
+    forward = renderer.frame_view(points, 1.5, camera=camera).axes[2]
     assert forward @ way > 0.9
-    turned = viz.frame_view(points, 1.5, yaw=np.pi / 2, camera=camera).axes[2]
+    turned = renderer.frame_view(points, 1.5, yaw=np.pi / 2, camera=camera).axes[2]
     np.testing.assert_allclose(turned, [-forward[1], forward[0], forward[2]], atol=1e-9)
 
 
 @pytest.mark.parametrize("camera", ["corner", "side", "front", "behind", "top"])
 def test_from_no_side_is_the_ground_white(
-    run: Path, tmp_path: Path, camera: viz.Preset, pictures: None
+    run: Path, tmp_path: Path, camera: renderer.Preset, opengl: None
 ):
     """Its chequers are to be seen."""
-    made = viz.render_frame(run, 1.0, size=SIZE, camera=camera, out=tmp_path / "a.png")
+    made = pictures.render_frame(
+        run, 1.0, size=SIZE, camera=camera, out=tmp_path / "a.png"
+    )
     assert np.mean(pixels(made).min(axis=2) > 250) < 0.02
 
 
 def test_a_frame_shows_the_state_at_its_time(
-    run: Path, rollout: Rollout, tmp_path: Path, pictures: None
+    run: Path, rollout: Rollout, tmp_path: Path, opengl: None
 ):
-    a = viz.render_frame(run, 1.0, size=SIZE, out=tmp_path / "a.png")
+    a = pictures.render_frame(run, 1.0, size=SIZE, out=tmp_path / "a.png")
     size = SIZE[0] / SIZE[1]
-    view = viz.view_of(rollout.world, viz._some(rollout.qpos, 60), size)
+    view = renderer.view_of(rollout.world, thinned(rollout.qpos, 60), size)
     row = int(np.argmin(np.abs(rollout.time - 1.0)))
-    with viz.Camera(rollout.world, SIZE) as camera:
+    with renderer.Camera(rollout.world, SIZE) as camera:
         wanted = np.asarray(camera.shot(rollout.qpos[row], view)).astype(int)
     assert np.array_equal(pixels(a), wanted)
-    b = viz.render_frame(run, 1.0, size=SIZE, camera="front", out=tmp_path / "b.png")
+    b = pictures.render_frame(
+        run, 1.0, size=SIZE, camera="front", out=tmp_path / "b.png"
+    )
     assert np.mean(np.any(pixels(a) != pixels(b), axis=2)) > 0.2
 
 
-def test_a_frame_of_a_plan_needs_no_physics(plan: Plan, tmp_path: Path, pictures: None):
+def test_a_frame_of_a_plan_needs_no_physics(plan: Plan, tmp_path: Path, opengl: None):
     io.save_plan(plan, tmp_path)
-    path = viz.render_frame(tmp_path, 0.5, size=SIZE)
+    path = pictures.render_frame(tmp_path, 0.5, size=SIZE)
     assert path == tmp_path / "frame-0.5.png"
     assert pixels(path).std() > 10
 
 
 def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(
-    run: Path, rollout: Rollout, tmp_path: Path, pictures: None
+    run: Path, rollout: Rollout, tmp_path: Path, opengl: None
 ):
     size = (320, 240)
-    path = viz.render_frame(
+    path = pictures.render_frame(
         run, 0.0, size=size, transparent=True, out=tmp_path / "t.png"
     )
     with Image.open(path) as picture:
@@ -472,7 +362,7 @@ def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(
         rgba = np.asarray(picture).astype(int)
     alpha = rgba[..., 3]
     world = rollout.world
-    view = viz.view_of(world, viz._some(rollout.qpos, 60), size[0] / size[1])
+    view = renderer.view_of(world, thinned(rollout.qpos, 60), size[0] / size[1])
     kin = Kinematics(world)
     kin.update(rollout.qpos[0])
     x, y = view.project(kin.com, size).round().astype(int)
@@ -490,16 +380,16 @@ def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(
 @pytest.mark.parametrize("time", [-0.1, 1e6, float("nan")])
 def test_a_time_that_the_run_has_not_is_one_sentence(run: Path, time: float):
     with pytest.raises(InputError, match="expected a time from 0 to"):
-        viz.render_frame(run, time, size=SIZE)
+        pictures.render_frame(run, time, size=SIZE)
 
 
 def test_a_picture_has_the_ending_of_its_format(
     run: Path, plan: Plan, rollout: Rollout
 ):
     with pytest.raises(InputError, match=r"ends in \.png"):
-        viz.render_frame(run, 0.0, out=run / "a.gif")
+        pictures.render_frame(run, 0.0, out=run / "a.gif")
     with pytest.raises(InputError, match=r"\.mp4 or \.webp"):
-        viz.video(plan, rollout, run, out=run / "a.avi")
+        renderer.video(plan, rollout, run, out=run / "a.avi")
 
 
 def test_an_mp4_without_ffmpeg_says_what_brings_it(
@@ -507,15 +397,15 @@ def test_an_mp4_without_ffmpeg_says_what_brings_it(
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(clamber.MissingDependency, match=r"clamber\[video\]"):
-        viz.video(plan, rollout, run, out=run / "a.mp4")
+        renderer.video(plan, rollout, run, out=run / "a.mp4")
 
 
 def test_a_video_has_the_size_and_side_that_was_asked(
-    plan: Plan, rollout: Rollout, tmp_path: Path, pictures: None
+    plan: Plan, rollout: Rollout, tmp_path: Path, opengl: None
 ):
     frames = {}
     for camera in ("corner", "behind"):
-        path = viz.video(
+        path = renderer.video(
             plan,
             short(rollout),
             tmp_path,

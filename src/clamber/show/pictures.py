@@ -1,0 +1,394 @@
+"""Sheets of pictures: robots, scenes, the keyframes of a plan, a climb; whole runs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from clamber.contact.contact import ContactSequence
+from clamber.errors import InputError
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import Robot
+from clamber.model.scene import GROUND, Scene
+from clamber.model.world import World, build_world
+from clamber.planning.records import Plan
+from clamber.recording.demonstration import Demonstration
+from clamber.run.folder import (
+    ROLLOUT,
+    TIMINGS,
+    TRAJECTORY,
+    load_plan,
+    load_rollout,
+    trajectory_of,
+    whole_file,
+)
+from clamber.show.plots import (
+    contact_plot,
+    cost_to_go_plot,
+    demonstration_plot,
+    stability_plot,
+)
+from clamber.show.renderer import (
+    DARK,
+    LINE,
+    PALE,
+    Camera,
+    Preset,
+    Report,
+    View,
+    font,
+    frame_view,
+    robot_corners,
+    video,
+    view_of,
+)
+from clamber.show.sample import changed, describe_change, row_at, sample_motion, thinned
+from clamber.step.posture import Keyframe
+
+SAMPLES = 400  # of a plot over time
+FRAME_SIZE = (1920, 1080)
+TILE = (400, 330)  # of the sheet of keyframes
+FORCE_LENGTH = 0.35  # [m] of the arrow of the robot's weight
+PHASE_COLOURS = {
+    "supporting": (22, 163, 74),
+    "reach-to-supportable": (234, 179, 8),
+    "sliding": (220, 38, 38),
+}
+
+
+def draw_robot(
+    robot: Robot, path: str | Path, *, tile: tuple[int, int] = (560, 640)
+) -> Path:
+    """Draw the robot as it stands, from behind and from ahead, its surfaces named.
+
+    A dot marks where each surface touches, a ring the mass that its limb supports.
+    """
+    world = build_world(robot, Scene(start=np.zeros(3)))
+    kin = Kinematics(world)
+    kin.update(world.home)
+    corners, up = robot_corners(kin), np.array([0.0, 0.0, 1.0])
+    fovy = float(world.model.vis.global_.fovy)
+    tiles = []
+    with Camera(world, tile) as camera:
+        for caption, turn in (("from behind", 0.0), ("from ahead", 2.4)):
+            view = frame_view(corners, tile[0] / tile[1], yaw=turn, fovy=fovy)
+            picture = camera.shot(world.home, view)
+            draw = ImageDraw.Draw(picture)
+            for limb in world.robot.limbs.values():
+                x, y = view.project(kin.landmark(limb.root)[1], tile)
+                draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline=DARK, width=2)
+                for surface, colour in zip(
+                    limb.surfaces, ((194, 65, 12), (29, 78, 216)), strict=False
+                ):
+                    at = tuple(view.project(kin.contact_point(surface, up), tile))
+                    _dot(draw, at, 5, colour)
+                    draw.text((at[0] + 8, at[1] - 8), surface, font=font(15), fill=DARK)
+            tiles.append((picture, [f"{world.robot.name}, {caption}"]))
+    return _save_sheet(tiles, path, columns=2)
+
+
+def draw_scene(
+    robot: Robot, scene: Scene, path: str | Path, *, tile: tuple[int, int] = (760, 560)
+) -> Path:
+    """Draw a scene with the robot at its start, its supports named, the goal marked."""
+    world = build_world(robot, scene)
+    kin = Kinematics(world)
+    kin.update(world.home)
+    tops = [s for s in scene.supports if s.name != GROUND]
+    seen = [robot_corners(kin)]
+    seen += [s.position + s.polygon @ s.rotation[:, :2].T for s in tops]
+    yaw, fovy = float(scene.start[2]), float(world.model.vis.global_.fovy)
+    view = frame_view(np.concatenate(seen), tile[0] / tile[1], yaw=yaw, fovy=fovy)
+    with Camera(world, tile) as camera:
+        picture = camera.shot(world.home, view)
+    draw = ImageDraw.Draw(picture)
+    for s in tops:
+        at, tip = view.project(
+            np.stack([s.position, s.position + 0.15 * s.normal]), tile
+        )
+        _arrow(draw, at, tip, DARK)
+        draw.text((at[0] + 8, at[1] + 4), s.name, font=font(15), fill=DARK)
+    if scene.goal is not None:
+        at = tuple(view.project(np.array([*scene.goal[:2], 0.0]), tile))
+        _dot(draw, at, 6, PHASE_COLOURS["supporting"])
+        draw.text((at[0] + 8, at[1] - 8), "goal", font=font(15), fill=DARK)
+    caption = f"{len(tops)} boxes, {robot.name} at the start"
+    return _save_sheet([(picture, [caption])], path, columns=1)
+
+
+def keyframe_sheet(
+    plan: Plan,
+    path: str | Path,
+    *,
+    tile: tuple[int, int] = TILE,
+    camera: Preset = "corner",
+) -> Path:
+    """Draw each keyframe with its contacts, forces and margins.
+
+    A dot marks each contact, seen through the robot: green while it supports, yellow
+    within reach of that, red where geometry alone would have it slide. Arrows are the
+    contact forces; a line falls from the centre of mass.
+    """
+    world = plan.world
+    view = view_of(world, [k.q for k in plan.keyframes], tile[0] / tile[1], camera)
+    tiles = []
+    with Camera(world, tile) as drawing:
+        for i, key in enumerate(plan.keyframes):
+            picture = drawing.shot(key.q, view)
+            mark_keyframe(picture, view, world, key)
+            before = plan.keyframes[i - 1] if i else None
+            tiles.append((picture, keyframe_caption(i, key, before)))
+    return _save_sheet(tiles, path, columns=min(4, len(tiles)))
+
+
+def keyframe_caption(i: int, key: Keyframe, before: Keyframe | None) -> list[str]:
+    """Three lines: the move, geometry and balance, forces."""
+    if before is None:
+        title = "start, on " + ", ".join(c.surface for c in key.stance)
+        new = {c.surface for c in key.stance}
+    else:
+        title = describe_change(before.stance, key.stance)
+        new = {c.surface for c in changed(before.stance, key.stance)[0]}
+    d = ", ".join(
+        f"d {c.contact.surface} {1000 * c.projected_distance:.0f} mm"
+        for c in key.contacts
+        if c.contact.surface in new
+    )
+    e = key.equilibrium
+    push = f"holds a push of {e.margin:.2f} weights" if e.feasible else "cannot hold"
+    limit = f", limit {e.limiting}" if e.limiting else ""
+    return [
+        f"{i}  {title}",
+        f"{d + '; ' if d else ''}CoM margin {1000 * key.com_margin:.0f} mm",
+        push + limit,
+    ]
+
+
+def mark_keyframe(
+    picture: Image.Image, view: View, world: World, key: Keyframe
+) -> None:
+    """Draw contacts, forces and the centre of mass over a picture."""
+    draw = ImageDraw.Draw(picture)
+    size, weight = picture.size, world.mass * 9.81
+    floor = max(
+        (s.position[2] for s in world.supports.values() if s.inside(key.com)),
+        default=0.0,
+    )
+    foot = np.array([*key.com[:2], floor])
+    a, b = (tuple(x) for x in view.project(np.array([key.com, foot]), size))
+    draw.line((a, b), fill=DARK, width=1)
+    _dot(draw, a, 5, DARK)
+    draw.line((b[0] - 5, b[1], b[0] + 5, b[1]), fill=DARK, width=2)
+    for state, force in zip(key.contacts, _force_by_contact(world, key), strict=True):
+        colour = PHASE_COLOURS[state.phase]
+        at = state.contact.position
+        ends = np.array([at, at + FORCE_LENGTH / weight * force])
+        tail, tip = view.project(ends, size)
+        if np.linalg.norm(tip - tail) > 8:
+            _arrow(draw, tail, tip, colour)
+        _dot(draw, tuple(tail), 5, colour)
+
+
+def _force_by_contact(world: World, key: Keyframe) -> list[np.ndarray]:
+    """(3,) [N] of each contact, over all its bearing points; zeros where unknown."""
+    kin = Kinematics(world)
+    kin.update(key.q)
+    counts = []
+    for c in key.stance:
+        normal = world.supports[c.support].normal
+        counts.append(len(kin.bearing_points(c.surface, normal, c.edge)))
+    if sum(counts) != len(key.equilibrium.forces):
+        return [np.zeros(3)] * len(counts)
+    ends = np.cumsum([0, *counts])
+    return [key.equilibrium.forces[a:b].sum(axis=0) for a, b in pairwise(ends)]
+
+
+def _dot(
+    draw: ImageDraw.ImageDraw, at: tuple, radius: int, colour: tuple[int, int, int]
+) -> None:
+    draw.circle(at, radius, fill=colour, outline=(255, 255, 255), width=1)
+
+
+def _arrow(
+    draw: ImageDraw.ImageDraw, tail: np.ndarray, tip: np.ndarray, colour: tuple
+) -> None:
+    way = (tip - tail) / np.linalg.norm(tip - tail)
+    side = np.array([-way[1], way[0]])
+    neck = tip - 9 * way
+    for width, fill in ((5, (255, 255, 255)), (3, colour)):
+        draw.line((*tail, *neck), fill=fill, width=width)
+    head = [tuple(tip), tuple(neck + 5 * side), tuple(neck - 5 * side)]
+    draw.polygon(head, fill=colour, outline=(255, 255, 255))
+
+
+def climb_sheet(
+    plan: Plan,
+    rollout: Rollout,
+    path: str | Path,
+    *,
+    frames: int = 12,
+    tile: tuple[int, int] = (300, 250),
+) -> Path:
+    """Draw what physics did, in pictures evenly spaced in time."""
+    rows = np.linspace(0, len(rollout.time) - 1, frames).round().astype(int)
+    view = view_of(rollout.world, thinned(rollout.qpos, 60), tile[0] / tile[1])
+    tiles = []
+    with Camera(rollout.world, tile) as camera:
+        for row in rows:
+            picture = camera.shot(rollout.qpos[row], view)
+            tiles.append((picture, [f"{rollout.time[row]:.1f} s"]))
+    return _save_sheet(tiles, path, columns=4, colours=200)
+
+
+def _save_sheet(
+    tiles: Sequence[tuple[Image.Image, list[str]]],
+    path: str | Path,
+    *,
+    columns: int,
+    colours: int | None = None,
+    gap: int = 6,
+) -> Path:
+    """Tiles in rows, each over its caption; with a palette the file is small."""
+    width, height = tiles[0][0].size
+    lines = max(len(c) for _, c in tiles)
+    band = 8 + 18 * lines
+    rows = -(-len(tiles) // columns)
+    size = (columns * (width + gap) + gap, rows * (height + band + gap) + gap)
+    sheet = Image.new("RGB", size, PALE)
+    draw = ImageDraw.Draw(sheet)
+    for i, (picture, caption) in enumerate(tiles):
+        row, column = divmod(i, columns)
+        x, y = gap + column * (width + gap), gap + row * (height + band + gap)
+        sheet.paste(picture, (x, y))
+        draw.rectangle((x, y, x + width - 1, y + height + band - 1), outline=LINE)
+        for k, text in enumerate(caption):
+            at = (x + 7, y + height + 4 + 18 * k)
+            draw.text(at, text, font=font(15 if k == 0 else 13), fill=DARK)
+    if colours is not None:
+        sheet = sheet.quantize(colours, dither=Image.Dither.NONE)
+    path = Path(path)
+    with whole_file(path) as draft:
+        sheet.save(draft, optimize=True)
+    return path
+
+
+def render_run(
+    folder: str | Path,
+    *,
+    with_video: bool = True,
+    demonstration: tuple[Demonstration, ContactSequence] | None = None,
+    report: Report | None = None,
+) -> list[Path]:
+    """Draw all there is to draw of a run folder, plots first.
+
+    Args:
+        folder: With a plan; with a rollout there is more to see.
+        with_video: Also the video, which takes the longest.
+        demonstration: The recording and what was found in it.
+        report: Told of stage, share done and a note.
+
+    Raises:
+        InputError: A file of the folder is missing or broken; what does without it is
+            drawn by then.
+        ClamberError: There is no OpenGL for pictures; the plots are done by then.
+    """
+    folder = Path(folder)
+    tell = report or (lambda stage, share, note: None)
+    plan, rollout, broken = _readable(folder)
+    files: list[Path] = []
+    tell("pictures", 0.0, "plots")
+    if demonstration is not None:
+        files.append(demonstration_plot(*demonstration, folder / "demonstration.png"))
+    if rollout is not None:
+        motion = sample_motion(plan, rollout, {}, SAMPLES)
+        asked = plan.options.keyframe.balance_margin
+        files.append(contact_plot(motion, folder / "contacts.png"))
+        files.append(stability_plot(motion, asked, folder / "stability.png"))
+    if plan.iterations:
+        files.append(cost_to_go_plot(plan, folder / "cost-to-go.png"))
+    tell("pictures", 0.4, "keyframes")
+    files.append(keyframe_sheet(plan, folder / "keyframes.png"))
+    if rollout is not None:
+        tell("pictures", 0.7, "climb")
+        files.append(climb_sheet(plan, rollout, folder / "climb.png"))
+        tell("pictures", 1.0, "")
+        if with_video:
+            files.append(video(plan, rollout, folder, report=tell))
+    if broken is not None:
+        raise broken
+    return files
+
+
+def _readable(folder: Path) -> tuple[Plan, Rollout | None, InputError | None]:
+    """A plan, a rollout, and why that is not all of a run folder that is broken.
+
+    Raises:
+        InputError: Of the plan.
+    """
+    broken, rollout = None, None
+    try:
+        plan = load_plan(folder)
+    except InputError as e:
+        broken, plan = e, load_plan(folder, without=(TIMINGS, TRAJECTORY))
+    if (folder / ROLLOUT).exists():
+        try:
+            rollout = load_rollout(folder)
+        except InputError as e:
+            broken = broken or e
+            with contextlib.suppress(InputError):
+                rollout = load_rollout(folder, with_events=False)
+    return plan, rollout, broken
+
+
+def render_frame(
+    folder: str | Path,
+    time: float,
+    *,
+    out: str | Path | None = None,
+    size: tuple[int, int] = FRAME_SIZE,
+    camera: Preset = "corner",
+    transparent: bool = False,
+) -> Path:
+    """Draw a run at one time as a PNG.
+
+    Args:
+        folder: A run folder; the plan is drawn where physics has not run.
+        time: [s]; the state at that time, or the last one before.
+        out: The file; `frame-<time>.png` in the run folder by default.
+        size: Width and height in pixels.
+        camera: From where.
+        transparent: Robot and obstacles alone, on nothing.
+
+    Raises:
+        InputError: A file is missing or broken, or there is no such time.
+        ClamberError: There is no OpenGL.
+    """
+    folder = Path(folder)
+    if (folder / ROLLOUT).exists():
+        motion = load_rollout(folder, with_events=False)
+        world, t, q = motion.world, motion.time, motion.qpos
+    else:
+        plan = load_plan(folder)
+        trajectory = trajectory_of(plan, folder)
+        world, t, q = plan.world, trajectory.time, trajectory.q
+    if not t[0] <= time <= t[-1]:
+        raise InputError(
+            f"a time from {t[0]:g} to {t[-1]:.2f} s", source="--frame", value=time
+        )
+    row = row_at(t, time)
+    path = folder / f"frame-{time:g}.png" if out is None else Path(out)
+    if path.suffix != ".png":
+        raise InputError("a name that ends in .png", source=path)
+    view = view_of(world, thinned(q, 60), size[0] / size[1], camera)
+    with Camera(world, size, cutout=transparent) as drawing:
+        draw = drawing.cutout if transparent else drawing.shot
+        picture = draw(q[row], view)
+    with whole_file(path) as draft:
+        picture.save(draft)
+    return path

@@ -1,0 +1,495 @@
+"""Pictures of a world without a screen, cameras that have all of it in view, videos.
+
+MuJoCo's own renderer draws, through EGL where there is one, else OSMesa. What is drawn
+depends on the records alone; the same run gives the same picture.
+
+Shapes: T samples, nq coordinates.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from clamber.errors import ClamberError, InputError, MissingDependency
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.model.scene import GROUND, Scene
+from clamber.model.world import World
+from clamber.planning.records import Plan
+from clamber.run.folder import whole_file
+from clamber.show.sample import describe_change, thinned
+
+Preset = Literal["corner", "side", "front", "behind", "top"]
+FROM_ABOVE = -70.0  # [deg] elevation from which the camera's light whitens the ground
+PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation, of a
+    # robot that faces along x. From the left and a little behind, the box hides neither
+    # the feet on the ground nor the hands on its top.
+    "corner": (288.0, -17.0),
+    "side": (270.0, -8.0),
+    "front": (180.0, -14.0),
+    "behind": (0.0, -20.0),
+    "top": (270.0, -89.0),
+}
+MARGIN = 0.08  # share of the picture left free around what must be seen
+EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
+GROUND_SHOWN = 5.5  # [m] half width of the ground in pictures
+FPS = 25
+VIDEO_SIZE, WEBP_SIZE = (640, 480), (480, 360)
+VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
+SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
+DARK, PALE, LINE = (35, 40, 48), (248, 249, 250), (205, 209, 214)
+Report = Callable[[str, float, str], None]
+_PROBE = (
+    "import mujoco; c = mujoco.GLContext(8, 8); c.make_current(); "
+    "mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
+)
+
+
+@functools.cache
+def gl_backend() -> str | None:
+    """`egl` or `osmesa`, whichever draws here; that of MUJOCO_GL alone where it is set.
+
+    Tried out in a process of its own: a library that fails to load, or crashes, would
+    spoil the next attempt in this one.
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    candidates = (wanted,) if wanted else ("egl", "osmesa")
+    if sys.platform != "linux":
+        candidates = ("",)
+    for name in candidates:
+        environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
+        trial = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment | {"MUJOCO_GL": name},
+            capture_output=True,
+            check=False,
+        )
+        if trial.returncode == 0:
+            return name
+    return None
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """An OpenGL context of the backend that works.
+
+    Raises:
+        ClamberError: There is none.
+    """
+    backend = gl_backend()
+    if backend is None:
+        raise ClamberError(
+            "pictures need OpenGL without a screen and there is none: "
+            "`apt-get install libegl1 libgl1-mesa-dri` (or libosmesa6) brings it; "
+            "plots, plan and physics do without"
+        )
+    if backend == "egl":
+        from mujoco.egl import GLContext
+    elif backend == "osmesa":
+        from mujoco.osmesa import GLContext
+    else:
+        from mujoco import GLContext
+    return GLContext(width, height)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """A camera: what it looks at [m], from how far [m] and from where [deg]."""
+
+    lookat: np.ndarray
+    distance: float
+    azimuth: float
+    elevation: float
+    fovy: float
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit vectors to the right, up and forward, in the world."""
+        return _camera_axes(self.azimuth, self.elevation)
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """(..., 2) pixels from the top left of points (..., 3) in the world."""
+        right, up, forward = self.axes
+        p = points - (self.lookat - self.distance * forward)
+        scale = size[1] / 2 / math.tan(math.radians(self.fovy) / 2) / (p @ forward)
+        x, y = size[0] / 2 + (p @ right) * scale, size[1] / 2 - (p @ up) * scale
+        return np.stack([x, y], axis=-1)
+
+
+def _camera_axes(
+    azimuth: float, elevation: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    a, e = math.radians(azimuth), math.radians(elevation)
+    forward = np.array(
+        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
+    )
+    right = np.array([math.sin(a), -math.cos(a), 0.0])
+    return right, np.cross(right, forward), forward
+
+
+class Camera:
+    """Draws configurations of a world; closed as a context manager."""
+
+    def __init__(
+        self,
+        world: World,
+        size: tuple[int, int],
+        *,
+        smooth: bool = True,
+        cutout: bool = False,
+    ) -> None:
+        """Open a context.
+
+        Args:
+            world: What to draw.
+            size: Width and height in pixels.
+            smooth: Edges are smoothed; costs three times the time in software.
+            cutout: For `cutout`, which smooths edges by itself; `shot` then lacks the
+                ground.
+        """
+        self._gl: Any = None
+        self._context: Any = None
+        width, height = size if not cutout else (2 * size[0], 2 * size[1])
+        model = copy.copy(world.model)  # looks are set here, the world's stay
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        model.vis.quality.offsamples = 4 if smooth and not cutout else 0
+        model.vis.quality.shadowsize = 2048 if height < 700 else 8192  # no steps seen
+        if not smooth:
+            model.vis.quality.numslices, model.vis.quality.numstacks = 16, 8
+        # A ground without end is shaded with speckles where the shadow map ends.
+        model.vis.map.shadowclip = 4.0
+        model.geom_size[world.support_geom[GROUND], :2] = GROUND_SHOWN
+        if cutout:
+            model.geom_matid[world.support_geom[GROUND]] = -1
+            model.geom_rgba[world.support_geom[GROUND], 3] = 0.0
+        self._model, self._data = model, mujoco.MjData(model)
+        self._gl = _gl_context(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(
+            model, mujoco.mjtFontScale.mjFONTSCALE_100.value
+        )
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 200)
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.zeros((height, width, 3), dtype=np.uint8)
+
+    def __enter__(self) -> Camera:
+        """Itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Free the context."""
+        if self._context is not None:
+            self._context.free()
+        if self._gl is not None:
+            self._gl.free()
+
+    def shot(self, q: np.ndarray, view: View) -> Image.Image:
+        """A picture of the configuration `q` (nq,)."""
+        self._update(q, view)
+        return Image.fromarray(self._drawn())
+
+    def cutout(self, q: np.ndarray, view: View) -> Image.Image:
+        """Robot and obstacles alone (RGBA), on nothing.
+
+        Drawn twice as large without smoothing, so that no pixel mixes with what lies
+        behind it, and averaged with its mask: edges keep their own colour.
+        """
+        self._update(q, view)
+        colour = self._drawn().astype(float)
+        flags = (
+            mujoco.mjtRndFlag.mjRND_SEGMENT.value,
+            mujoco.mjtRndFlag.mjRND_IDCOLOR.value,
+        )
+        self._scene.flags[list(flags)] = 1
+        there = np.any(self._drawn() > 0, axis=2)[..., None].astype(float)
+        self._scene.flags[list(flags)] = 0
+        height, width = there.shape[0] // 2, there.shape[1] // 2
+
+        def halved(x: np.ndarray) -> np.ndarray:
+            return x.reshape(height, 2, width, 2, -1).mean(axis=(1, 3))
+
+        share = halved(there)
+        colour = halved(colour * there) / np.maximum(share, 1e-9)
+        pixels = np.concatenate([colour, 255 * share], axis=2)
+        return Image.fromarray(pixels.round().astype(np.uint8), "RGBA")
+
+    def _update(self, q: np.ndarray, view: View) -> None:
+        self._data.qpos[:] = q
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._camera.lookat[:] = view.lookat
+        self._camera.distance = view.distance
+        self._camera.azimuth, self._camera.elevation = view.azimuth, view.elevation
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        if view.elevation < FROM_ABOVE:  # the sun alone lights the ground enough
+            for light in self._scene.lights[: self._scene.nlight]:
+                if light.headlight:
+                    light.diffuse = light.specular = np.zeros(3)
+
+    def _drawn(self) -> np.ndarray:
+        """(height, width, 3) uint8 of the scene as it was last updated."""
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+        return self._pixels[::-1].copy()
+
+
+def frame_view(
+    points: np.ndarray,
+    aspect: float,
+    *,
+    yaw: float = 0.0,
+    fovy: float = 45.0,
+    camera: Preset = "corner",
+) -> View:
+    """The nearest view that has all of the points (N, 3) in the picture.
+
+    With camera axes r (right), u (up), f (forward) and the picture's half widths t_r,
+    t_u at unit depth, a point p is seen from P where |(p - P) r| <= t_r (p - P) f, and
+    likewise for u: linear in P, and solved for the P farthest forward.
+
+    Args:
+        points: [m] in the world.
+        aspect: Width over height of the picture.
+        yaw: Way the robot faces at its start [rad].
+        fovy: Vertical field of view [deg].
+        camera: From where.
+    """
+    azimuth, elevation = PRESETS[camera]
+    azimuth += math.degrees(yaw)
+    right, up, forward = _camera_axes(azimuth, elevation)
+    depth = points @ forward
+    half = math.tan(math.radians(fovy) / 2) * (1 - MARGIN)
+    ends, nearest = [], math.inf
+    for axis, t in ((right, half * aspect), (up, half)):
+        x = points @ axis
+        low, high = float(np.max(x - t * depth)), float(np.min(x + t * depth))
+        ends.append((low + high) / 2)
+        nearest = min(nearest, (high - low) / (2 * t))
+    distance = float(depth.mean()) - nearest
+    position = ends[0] * right + ends[1] * up + nearest * forward
+    return View(
+        lookat=position + distance * forward,
+        distance=distance,
+        azimuth=azimuth,
+        elevation=elevation,
+        fovy=fovy,
+    )
+
+
+def robot_corners(kin: Kinematics) -> np.ndarray:
+    """(8 G, 3) corners of the boxes around the robot's geoms, in the world [m]."""
+    m, d = kin.world.model, kin.data
+    own = np.flatnonzero(m.body_rootid[m.geom_bodyid] == m.body_rootid[kin.world.base])
+    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(8, 3)
+    local = m.geom_aabb[own, None, :3] + signs * m.geom_aabb[own, None, 3:]
+    R = d.geom_xmat[own].reshape(-1, 3, 3)
+    return (np.einsum("gij,gkj->gki", R, local) + d.geom_xpos[own, None]).reshape(-1, 3)
+
+
+def view_of(
+    world: World,
+    postures: Iterable[np.ndarray],
+    aspect: float,
+    camera: Preset = "corner",
+) -> View:
+    """A view with the robot in all postures, and the near edge of the first box."""
+    kin = Kinematics(world)
+    points = []
+    for q in postures:
+        kin.update(q)
+        points.append(robot_corners(kin))
+    points += [near_edge_points(world.scene)]
+    fovy = float(world.model.vis.global_.fovy)
+    seen = np.concatenate(points)
+    yaw = float(world.scene.start[2])
+    return frame_view(seen, aspect, yaw=yaw, fovy=fovy, camera=camera)
+
+
+def near_edge_points(scene: Scene) -> np.ndarray:
+    """(n, 3) where the first box's top begins, seen from the start, and below it."""
+    if not scene.boxes:
+        return np.zeros((0, 3))
+    top = scene.boxes[0].top
+    start = np.array([*scene.start[:2], 0.0])
+    A, b = top.edges()
+    facing = int(np.argmax(A @ start - b))
+    corners = top.position + top.polygon @ top.rotation[:, :2].T
+    c, d = corners[facing], corners[(facing + 1) % len(corners)]
+    way = (d - c) / np.linalg.norm(d - c)
+    foot = float(np.clip((start - c) @ way, 0.0, np.linalg.norm(d - c)))
+    span = np.clip([foot - EDGE_SHOWN, foot + EDGE_SHOWN], 0, np.linalg.norm(d - c))
+    edge = c + span[:, None] * way
+    return np.concatenate([edge, edge * [1.0, 1.0, 0.0]])
+
+
+def seen_points(kin: Kinematics, q: np.ndarray) -> np.ndarray:
+    """(m, 3) points that a camera has to have in view [m].
+
+    They are the corners of boxes around some of the postures (n, nq), and the near
+    edge.
+    """
+    corners = []
+    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    for posture in thinned(q, 40):
+        kin.update(posture)
+        points = robot_corners(kin)
+        low, high = points.min(axis=0), points.max(axis=0)
+        corners.append(low + sides * (high - low))
+    return np.concatenate([*corners, near_edge_points(kin.world.scene)]).round(3)
+
+
+@functools.cache
+def font(size: int) -> Any:
+    """Of captions, by its size in pixels."""
+    return ImageFont.load_default(size=size)
+
+
+def speedup_of(duration: float) -> int:
+    """How much faster than it was a run of that many seconds is shown."""
+    speedup = 1
+    while duration > SPEEDUP_AFTER and duration / speedup > VIDEO_SECONDS:
+        speedup *= 2
+    return speedup
+
+
+def video(
+    plan: Plan,
+    rollout: Rollout,
+    folder: str | Path,
+    *,
+    out: str | Path | None = None,
+    size: tuple[int, int] | None = None,
+    camera: Preset = "corner",
+    report: Report | None = None,
+) -> Path:
+    """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg.
+
+    Args:
+        plan: What was to be done.
+        rollout: What physics made of it.
+        folder: Where the video goes under its usual name.
+        out: The file instead, an `.mp4` or a `.webp`.
+        size: Width and height in pixels, even numbers.
+        camera: From where.
+        report: Told of the share done.
+
+    Raises:
+        InputError: Another ending.
+        MissingDependency: An `.mp4` was asked for and there is no ffmpeg.
+    """
+    has_ffmpeg = importlib.util.find_spec("imageio_ffmpeg") is not None
+    if out is None:
+        out = Path(folder) / ("video.mp4" if has_ffmpeg else "video.webp")
+    path = Path(out)
+    if path.suffix not in (".mp4", ".webp"):
+        raise InputError("a name that ends in .mp4 or .webp", source=path)
+    if path.suffix == ".mp4" and not has_ffmpeg:
+        raise MissingDependency("imageio-ffmpeg", "video")
+    fps, usual = (FPS, VIDEO_SIZE) if path.suffix == ".mp4" else (FPS / 2, WEBP_SIZE)
+    size = size or usual
+    frames = _frames(
+        plan, rollout, fps, size, camera, report or (lambda stage, share, note: None)
+    )
+    with whole_file(path) as draft:
+        if path.suffix == ".mp4":
+            _write_mp4(frames, draft, size)
+        else:
+            first, *rest = frames
+            options: dict[str, Any] = {"quality": 70, "method": 0, "loop": 0}
+            first.save(
+                draft,
+                save_all=True,
+                append_images=rest,
+                duration=round(1000 / fps),
+                **options,
+            )
+    return path
+
+
+def _frames(
+    plan: Plan,
+    rollout: Rollout,
+    fps: float,
+    size: tuple[int, int],
+    camera: Preset,
+    report: Report,
+) -> Iterator[Image.Image]:
+    """Pictures of the rollout with its clock and the move under way."""
+    duration = float(rollout.time[-1])
+    speedup = speedup_of(duration)
+    times = np.arange(0.0, duration, speedup / fps)
+    rows = np.searchsorted(rollout.time, times)
+    moves = [describe_change(a.stance, b.stance) for a, b in pairwise(plan.keyframes)]
+    starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
+    drawn = (
+        size[0] * 5 // 4,
+        size[1] * 5 // 4,
+    )  # smoother edges at a third of the price
+    view = view_of(rollout.world, thinned(rollout.qpos, 60), size[0] / size[1], camera)
+    letters = max(18, round(size[1] / 30))
+    with Camera(rollout.world, drawn, smooth=False) as drawing:
+        for i, (row, t) in enumerate(zip(rows, times, strict=True)):
+            if i % 10 == 0:
+                report("video", i / len(rows), "")
+            picture = drawing.shot(rollout.qpos[row], view)
+            picture = picture.resize(size, Image.Resampling.BILINEAR)
+            # On its way to where the first move begins, it is that one's.
+            move = max(int(np.searchsorted(starts, t, side="right")), 1)
+            text = moves[move - 1] if move <= len(moves) else "done"
+            clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
+            draw = ImageDraw.Draw(picture)
+            line = size[1] - letters - 10
+            draw.text((12, line), clock, font=font(letters), fill=DARK)
+            at = (size[0] - 12, line)
+            draw.text(at, text, font=font(letters), fill=DARK, anchor="ra")
+            yield picture
+    report("video", 1.0, "")
+
+
+def _write_mp4(
+    frames: Iterable[Image.Image], path: Path, size: tuple[int, int]
+) -> None:
+    import imageio_ffmpeg
+
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        size,
+        fps=FPS,
+        codec="libx264",
+        quality=5,
+        macro_block_size=2,
+        output_params=[
+            "-preset", "veryfast", "-movflags", "+faststart",
+            "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
+        ],
+    )  # fmt: skip
+    writer.send(None)
+    try:
+        for frame in frames:
+            writer.send(frame.tobytes())
+    finally:
+        writer.close()

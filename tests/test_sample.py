@@ -1,0 +1,155 @@
+"""What there is to see of a run: the same series for plots, tables and 3D."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clamber.execution.simulation import Rollout
+from clamber.model.kinematics import Kinematics
+from clamber.planning.records import Plan
+from clamber.show import sample
+from conftest import contact
+
+
+@pytest.fixture(scope="module")
+def plan(one_hand_plan: Plan) -> Plan:
+    return one_hand_plan
+
+
+@pytest.fixture(scope="module")
+def rollout(one_hand_rollout: Rollout) -> Rollout:
+    return one_hand_rollout
+
+
+def test_moves_are_described_by_what_changed():
+    feet = [contact("LFoot", "ground", 0, 0, 0), contact("RFoot", "ground", 0, 0, 0)]
+    hand = contact("LHand", "box", 0.4, 0.1, 0.2)
+    elbow = contact("LElbow", "box", 0.4, 0.1, 0.2)
+    moved = replace(hand, position=np.array([0.5, 0.1, 0.2]))
+    assert sample.describe_change(feet, [*feet, hand]) == "LHand on box"
+    assert (
+        sample.describe_change([*feet, hand], [*feet, elbow])
+        == "LElbow on box for LHand"
+    )
+    assert sample.describe_change([*feet, hand], [*feet, moved]) == "LHand on box"
+    assert sample.describe_change([*feet, hand], feet) == "LHand in the air"
+    assert sample.describe_change(feet, feet) == "no change"
+
+
+# Series.
+
+
+def test_the_figures_at_the_end_are_those_of_the_last_keyframe(
+    plan: Plan, rollout: Rollout
+):
+    motion = sample.sample_motion(plan, rollout, {}, 10)
+    assert motion.loaded is not None
+    key, names = plan.keyframes[-1], list(plan.world.surfaces)
+    loaded = {s for s, x in zip(names, motion.loaded[-1], strict=True) if x}
+    assert loaded == {c.contact.surface for c in key.contacts}
+    for c in key.contacts:
+        j = names.index(c.contact.surface)
+        d, limit = motion.distance[-1, j], motion.limit[-1, j]
+        assert d == pytest.approx(c.projected_distance, abs=0.015)
+        assert (d <= limit) == (c.phase == "supporting")
+    assert motion.margin[-1] == pytest.approx(key.com_margin, abs=0.015)
+
+
+def test_nothing_loaded_has_no_margin(plan: Plan, rollout: Rollout):
+    flying = replace(rollout, contact_force=np.zeros_like(rollout.contact_force))
+    motion = sample.sample_motion(plan, flying, {}, 5)
+    assert np.isnan(motion.margin).all()
+    assert motion.loads == [[] for _ in plan.world.surfaces]
+
+
+def test_a_surface_stands_on_the_support_below_it(plan: Plan, rollout: Rollout):
+    kin = Kinematics(plan.world)
+    kin.update(rollout.qpos[-1])
+    assert sample.support_below(plan.world, kin, "LHand").name == "box"
+    assert sample.support_below(plan.world, kin, "RFoot").name == "ground"
+
+
+def test_runs_of_a_mask_are_half_open():
+    mask = np.array([1, 1, 0, 0, 1, 0, 1], dtype=bool)
+    assert sample.runs_of(mask) == [(0, 2), (4, 5), (6, 7)]
+    assert sample.runs_of(np.zeros(3, dtype=bool)) == []
+
+
+def test_no_peak_is_lost_between_samples(rng: np.random.Generator):
+    x = rng.normal(size=(100, 3))
+    rows = np.array([0, 7, 30, 99])
+    peaks = sample.peaks(x, rows)
+    for i, (a, b) in enumerate([(0, 7), (7, 30), (30, 99), (99, 100)]):
+        for j in range(3):
+            part = x[a:b, j]
+            assert peaks[i, j] == part[np.abs(part).argmax()]
+
+
+def test_rows_are_even_keep_the_end_and_fit():
+    t = np.arange(1001) * 0.01
+    rows = sample.even_rows(t, 10_000)
+    assert rows[0] == 0
+    assert rows[-1] == 1000
+    assert len(rows) == 251
+    assert len(sample.even_rows(t, 20)) <= 21
+    assert sample.even_rows(t[:1], 20).tolist() == [0]
+
+
+def test_short_gaps_and_touches_are_none(rollout: Rollout):
+    force = np.zeros_like(rollout.contact_force)
+    force[10:60, 0, 2] = 100.0
+    force[30:34, 0, 2] = 0.0  # 40 ms without
+    force[20:40, 1, 2] = 100.0
+    force[50:53, 1, 2] = 100.0  # 30 ms with
+    force[70:80, 2, 2] = 100.0
+    force[90:99, 2, 2] = 100.0  # after 100 ms
+    force[2:9, 3, 2] = 100.0  # all but from the beginning
+    force[0:3, 4, 2] = 100.0  # no longer than that
+    force[8:20, 5, 2] = 100.0  # later
+    steady = sample.steadily_loaded(replace(rollout, contact_force=force))
+    runs = [sample.runs_of(column) for column in steady.T]
+    assert runs[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
+    assert runs[3:6] == [[(0, 9)], [(0, 3)], [(8, 20)]]
+    assert not any(runs[6:])
+
+
+# When keyframes are reached.
+
+
+def test_keyframes_are_reached_when_the_plan_says(plan: Plan, rollout: Rollout):
+    assert plan.trajectory is not None
+    assert sample.keyframe_times(plan, rollout) == plan.trajectory.keyframes.tolist()
+    early = replace(rollout, time=rollout.time * 0.5)
+    assert sample.keyframe_times(plan, early) == [0.0, None]
+    bare = replace(plan, trajectory=None)
+    assert sample.keyframe_times(bare, None) == [0.0, 1.0]
+
+
+def test_keyframes_of_an_adapted_run_are_found_by_their_contacts(
+    plan: Plan, rollout: Rollout
+):
+    first = plan.trajectory
+    assert first is not None
+    wait = 400  # samples that the robot stood still before it began
+
+    def later(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.repeat(x[:1], wait, axis=0), x])
+
+    followed = replace(
+        first,
+        time=np.arange(len(first.time) + wait) * 0.001,
+        q=later(first.q),
+        v=later(first.v),
+        tau=later(first.tau),
+        contact=later(first.contact),
+        keyframes=np.zeros(1),
+    )
+    adapted = replace(rollout, followed=followed, time=rollout.time + 0.4)
+    start, hand = sample.keyframe_times(plan, adapted)
+    assert start == pytest.approx(0.0, abs=0.5)
+    assert hand == pytest.approx(first.keyframes[1] + 0.4, abs=0.3)
+    never = replace(followed, contact=np.zeros_like(followed.contact))
+    assert sample.keyframe_times(plan, replace(adapted, followed=never)) == [None] * 2
