@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError
-from clamber.model.scene import Box, Scene, load_scene
+from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
-from clamber.model.terrain import read_drawn_boxes
+from clamber.model.terrain import load_scene
 from clamber.planning.diagnose import check_scene
 from clamber.step.path import highest
 from clamber.step.statics import contact_angle
@@ -104,7 +104,7 @@ def test_a_missing_drawing_is_named(tmp_path):
     with pytest.raises(InputError, match=r"gone\.obj"):
         load_scene(tmp_path / "s.yaml")
     with pytest.raises(InputError, match=r"gone\.xml"):
-        read_drawn_boxes(tmp_path / "gone.xml")
+        load_scene(tmp_path / "gone.xml")
 
 
 def slope(pitch: float, friction: float = 0.8, x: float = 1.0) -> Box:

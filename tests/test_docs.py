@@ -177,7 +177,7 @@ def _redirected(words: Sequence[str]) -> int:
 def read_yaml_block(block: Block, folder: Path) -> None:
     """Have a YAML block read by the reader that its fields belong to."""
     from clamber.model.robot import RobotFile
-    from clamber.model.scene import SceneFile
+    from clamber.model.terrain import SceneFile
     from clamber.recording.recording import RecordingFile
     from clamber.run.folder import _StateOnDisk
     from clamber.study.spec import Spec, next_runs, strands

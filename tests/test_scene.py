@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import qpsolvers
 import yaml
 
 from clamber.errors import InputError
-from clamber.model.scene import GROUND, Box, Scene, Support, load_scene
+from clamber.model.scene import GROUND, Box, Scene, Support
 from clamber.model.se3 import matrix_from_rpy
+from clamber.model.terrain import load_scene
 from clamber.run.folder import scene_fields
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -76,7 +78,7 @@ def test_friction_of_a_height_holds_for_box_and_ground():
 
 @pytest.mark.parametrize("height", [0.0, -0.2, math.nan, math.inf, 275.0])
 def test_no_height_but_a_positive_one_in_metres_is_taken(height):
-    with pytest.raises(ValueError, match="size"):
+    with pytest.raises(InputError, match="height"):
         Scene.from_height(height)
 
 
@@ -166,6 +168,9 @@ def test_a_triangle_is_a_support_as_well():
         np.array([[0, 0], [2, 0], [2, 2], [1, 0.5]]),  # a dent
         np.array([[0, 0], [1, 0], [2, 0], [1, 1]]),  # three in a line
         np.array([[0, 0], [1, 0], [1, 0], [0, 1]]),  # twice the same
+        np.array([[np.cos(a), np.sin(a)] for a in 0.8 * np.pi * np.arange(5)]),  # star
+        np.array([[0, 0], [1, 0]]),
+        np.zeros((0, 2)),
     ],
 )
 def test_a_polygon_that_is_not_convex_and_ccw_is_refused(polygon):
@@ -197,6 +202,102 @@ def test_supports_come_ground_first_and_are_found_by_name():
 def test_two_boxes_of_one_name_make_no_scene():
     with pytest.raises(ValueError, match="unique"):
         Scene(boxes=(box_at(), box_at()), start=np.zeros(3))
+
+
+# Places on supports.
+
+
+def polygon_of(rng, corners: int) -> np.ndarray:
+    """(K, 2) convex, counter-clockwise, about its middle: points of an ellipse."""
+    angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    while np.diff(np.append(angles, angles[0] + 2 * np.pi)).max() > 2.8:
+        angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    return np.stack([0.9 * np.cos(angles), 0.5 * np.sin(angles)], axis=1)
+
+
+@pytest.mark.parametrize("corners", [3, 4, 5, 9])
+@pytest.mark.parametrize("inset", [0.0, 0.05])
+def test_the_nearest_point_is_what_a_qp_finds(rng, corners, inset):
+    for _ in range(8):
+        s = support_of(polygon_of(rng, corners), rng.uniform(-0.5, 0.5, 3))
+        A, b = s.edges()
+        for p in s.position + rng.uniform(-1.2, 1.2, (8, 3)):
+            plane, at = s.normal[None], np.array([s.normal @ s.position])
+            truth = qpsolvers.solve_qp(
+                np.eye(3), -p, A, b - inset, plane, at, solver="daqp"
+            )
+            if truth is not None:
+                np.testing.assert_allclose(s.nearest(p, inset), truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("inset", [0.0, 0.015, 0.2])
+def test_of_a_rectangle_the_nearest_point_is_clipped_to_the_bit(rng, inset):
+    top = box_at((0.2, -0.1, 0.7)).top
+    half = top.polygon.max(axis=0) - inset
+    for p in rng.uniform(-1.0, 1.0, (20, 3)):
+        local = top.rotation.T @ (p - top.position)
+        clipped = [*np.clip(local[:2], -half, half), 0]
+        truth = top.position + top.rotation @ np.array(clipped)
+        np.testing.assert_array_equal(top.nearest(p, inset), truth)
+
+
+def test_where_a_support_is_too_narrow_the_nearest_point_is_on_its_middle():
+    box = box_at(size=(0.8, 0.1, 0.3), position=(0.0, 0.0, 0.15)).top
+    np.testing.assert_allclose(
+        box.nearest(np.array([0.2, 9.0, 0.3]), 0.06), [0.2, 0.0, 0.3]
+    )
+    triangle = support_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    radius = 1.0 - math.sqrt(0.5)  # of the incircle: there is one deepest point
+    middle = triangle.position + np.array([radius, radius, 0.0])
+    found = triangle.nearest(np.array([5.0, 0.0, 0.0]), inset=0.4)
+    np.testing.assert_allclose(found, middle, atol=1e-6)
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.7), (0.2, -0.3, 2.0)])
+def test_the_edge_towards_a_place_is_the_nearest_of_all_points_of_the_border(rng, rpy):
+    s = support_of(polygon_of(rng, 6), rpy)
+    ends = np.roll(s.vertices, -1, axis=0)
+    share = np.linspace(0, 1, 400)[:, None, None]
+    border = (s.vertices + share * (ends - s.vertices)).reshape(-1, 3)
+    for p in s.position[:2] + rng.uniform(-2, 2, (20, 2)):
+        edge = s.edge_towards(p)
+        gaps = np.linalg.norm(border[:, :2] - p, axis=1)
+        assert np.linalg.norm(edge.point[:2] - p) <= gaps.min() + 1e-12
+        np.testing.assert_allclose(edge.point, border[gaps.argmin()], atol=0.01)
+        # The whole support lies behind the edge, which is level ground's x axis.
+        behind = [edge.distance(v) for v in s.vertices]
+        np.testing.assert_allclose(sorted(behind)[:2], 0.0, atol=1e-12)
+        np.testing.assert_allclose(edge.rotation[:2, 0], edge.inward)
+        np.testing.assert_allclose(
+            edge.rotation, matrix_from_rpy([0.0, 0.0, edge.yaw]), atol=1e-12
+        )
+
+
+def test_of_two_edges_at_a_corner_that_is_taken_which_faces_the_place():
+    square = support_of(SQUARE)
+    corner = square.position[:2] - 1.0
+    edge = square.edge_towards(corner - [0.3, 0.1])
+    np.testing.assert_allclose(edge.point[:2], corner)
+    np.testing.assert_allclose(edge.inward, [1.0, 0.0], atol=1e-12)
+
+
+def test_the_support_below_is_the_highest_that_is_there(rng):
+    low = box_at((0.1, 0.0, 0.3), size=(1.0, 1.0, 0.3), position=(0.0, 0.0, 0.15))
+    shelf = replace(low, name="shelf", position=np.array([0.4, 0.0, 0.8]))
+    scene = Scene(boxes=(low, shelf), start=np.zeros(3))
+    for p in rng.uniform([-1, -1, 0], [1, 1, 1.2], (200, 3)):
+        best = GROUND, 0.0
+        for s in scene.supports[1:]:  # where a plumb line meets each plane
+            drop = float(s.height(p) / s.normal[2])
+            if drop >= 0 and s.inside(p - [0, 0, drop]) and p[2] - drop > best[1]:
+                best = s.name, p[2] - drop
+        found = scene.below(p)
+        assert found is not None
+        assert found.name == best[0]
+        assert found.level(p) == pytest.approx(best[1])
+    assert scene.below(np.array([0.0, 0.0, -0.1])) is None
+    beside = shelf.top.position + np.array([0.0, 0.52, -0.01])
+    assert [scene.below(beside, x).name for x in (0.0, 0.1)] == [GROUND, "shelf"]
 
 
 # Files.

@@ -9,7 +9,6 @@ from clamber.contact.policy import Option as Option
 from clamber.contact.policy import PelvisDistribution as PelvisDistribution
 from clamber.contact.policy import pelvis_distribution as pelvis_distribution
 from clamber.errors import ClamberError as ClamberError
-from clamber.errors import Infeasible as Infeasible
 from clamber.errors import InputError as InputError
 from clamber.errors import MissingDependency as MissingDependency
 from clamber.errors import Status as Status
@@ -29,7 +28,7 @@ from clamber.model.robot import load_robot as load_robot
 from clamber.model.scene import Box as Box
 from clamber.model.scene import Scene as Scene
 from clamber.model.scene import Support as Support
-from clamber.model.scene import load_scene as load_scene
+from clamber.model.terrain import load_scene as load_scene
 from clamber.model.world import World as World
 from clamber.model.world import build_world as build_world
 from clamber.planning.diagnose import Checkup as Checkup

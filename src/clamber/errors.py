@@ -1,13 +1,18 @@
 """What can go wrong, as values and as exceptions.
 
 A user's mistake is an `InputError` that names file, field, value and what was
-expected. A problem without a solution is a `Status`, raised as `Infeasible` only on
-request. A missing optional package is a `MissingDependency` with the line that gets it.
+expected; a file that people write is read by `read_yaml` and checked by `validated`,
+which raise it. A problem without a solution is a `Status`. A missing optional package
+is a `MissingDependency` with the line that gets it.
 """
 
 from __future__ import annotations
 
 import enum
+from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 class ClamberError(Exception):
@@ -27,18 +32,13 @@ class InputError(ClamberError):
     def __init__(
         self,
         expected: str,
-        *,
         source: object = None,
         field: str | None = None,
         value: object = None,
     ) -> None:
         """Compose the sentence."""
-        self.expected, self.source, self.field, self.value = (
-            expected,
-            source,
-            field,
-            value,
-        )
+        self.expected, self.source = expected, source
+        self.field, self.value = field, value
         where = ": ".join(str(x) for x in (source, field) if x is not None)
         what = ":" if value is None else f" is {value!r};"
         sentence = f"{where}{what} expected {expected}" if where else expected
@@ -50,16 +50,7 @@ def unreadable(
 ) -> InputError:
     """A file that cannot be opened, why, and what to do then."""
     why = error.strerror or "unreadable"
-    return InputError(f"a readable file ({why}); {then}", source=path)
-
-
-class Infeasible(ClamberError):
-    """A problem has no solution; `result` holds the best that was found."""
-
-    def __init__(self, message: str, result: object = None) -> None:
-        """Keep the best that was found."""
-        self.result = result
-        super().__init__(message)
+    return InputError(f"a readable file ({why}); {then}", path)
 
 
 class MissingDependency(ClamberError):
@@ -77,9 +68,70 @@ class Status(enum.Enum):
     """How a solve ended: a sentence that says what to try next."""
 
     SOLVED = "solved"
-    NOT_CONVERGED = "iterations ran out before the contacts closed: allow more"
     UNREACHABLE = "a contact cannot be reached: move the contact or the obstacle"
     UNBALANCED = "the centre of mass cannot be held over the supporting contacts"
     COLLIDING = "links collide or come closer than the safety distance"
     SLIDING = "a new contact cannot support its mass within the friction cone"
     OVERLOADED = "no contact forces within the friction cones and torque limits hold it"
+
+
+def read_yaml(path: Path) -> dict:
+    """A YAML mapping from disk.
+
+    Raises:
+        InputError: The file is missing, unreadable or no mapping.
+    """
+    import yaml  # slow to import, as pydantic below: who catches errors needs neither
+
+    try:
+        content = yaml.safe_load(path.read_text())
+    except OSError as e:
+        raise unreadable(path, e) from e
+    except (yaml.YAMLError, UnicodeDecodeError) as e:
+        fault = str(e).splitlines()[0]
+        if isinstance(e, yaml.MarkedYAMLError) and e.problem_mark is not None:
+            fault = f"line {e.problem_mark.line + 1}: {e.problem}"
+        raise InputError(f"YAML ({fault})", path) from e
+    if not isinstance(content, dict):
+        raise InputError("a mapping of fields", path, value=type(content).__name__)
+    return content
+
+
+def validated(kind: type[T], content: object, source: object) -> T:
+    """What pydantic makes of content read from `source`.
+
+    Args:
+        kind: A pydantic model, a dataclass, or any type that pydantic knows.
+        content: Mappings, lists and plain values, as YAML or JSON have them.
+        source: Named in errors: the file.
+
+    Raises:
+        InputError: A field is missing, unknown, or has a value that cannot be used.
+    """
+    import pydantic
+
+    try:
+        return pydantic.TypeAdapter(kind).validate_python(content)
+    except pydantic.ValidationError as e:
+        raise input_error(e, source) from e
+
+
+def input_error(error: ValueError, source: object) -> InputError:
+    """The first fault of a pydantic validation, with file, field and value."""
+    import pydantic
+
+    assert isinstance(error, pydantic.ValidationError)
+    first = error.errors()[0]
+    # Where a field may be one of two shapes, pydantic adds the shape to the path.
+    shapes = ("tuple[", "union[", "list[")
+    where = ".".join(x for x in map(str, first["loc"]) if not x.startswith(shapes))
+    text = first["msg"].removeprefix("Value error, ").removeprefix("expected ")
+    text = text.removeprefix("Input should be ")
+    value = first.get("input")
+    if first["type"] == "missing":
+        text, value = "a value: it is missing", None
+    elif first["type"] == "extra_forbidden":
+        text = "no such field: mend its name, or leave it out"
+    if not where:  # the fields together are wrong: their values are no help
+        return InputError(text, source)
+    return InputError(text, source, where, value)

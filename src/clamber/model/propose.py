@@ -24,7 +24,7 @@ import yaml
 from scipy.optimize import brentq, least_squares
 from scipy.spatial import ConvexHull, QhullError
 
-from clamber.errors import InputError
+from clamber.errors import InputError, read_yaml, validated
 from clamber.model.description import (
     MESHES,
     Description,
@@ -43,7 +43,6 @@ from clamber.model.limbs import (
     link_points,
     links_of,
 )
-from clamber.model.scene import input_error, read_yaml
 from clamber.model.se3 import matrix_from_quat, quat_from_matrix, rotation_vector
 
 HEAVY = 1.0  # [kg] a link this heavy without collision shape gets one
@@ -76,7 +75,7 @@ COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbo
 HAND_SHARE = 0.25  # of the weight, that a hand bears for ankles to position themselves
 ROUNDING = 1e-6  # share of a moment of inertia
 GUESSED_EFFORT = {"leg": 0.8, "trunk": 0.6, "arm": 0.25}  # of weight times thigh
-_EFFORTS = pydantic.TypeAdapter(dict[str, Annotated[float, pydantic.Field(gt=0)]])
+_Efforts = dict[str, Annotated[float, pydantic.Field(gt=0)]]
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -837,10 +836,7 @@ def _solve_arm(model: mujoco.MjModel, q: np.ndarray, chain: Chain, side: float) 
 def _known_efforts(path: Path) -> dict[str, float]:
     """Effort limits by joint of a YAML mapping or of another description."""
     if path.suffix in (".yaml", ".yml", ".json"):
-        try:
-            return _EFFORTS.validate_python(read_yaml(path))
-        except pydantic.ValidationError as e:
-            raise input_error(e, path) from e
+        return validated(_Efforts, read_yaml(path), path)
     description = read_description(path, lenient=True)
     description.spec.compiler.boundmass = 1e-3
     description.spec.compiler.boundinertia = 1e-6

@@ -15,10 +15,9 @@ import mujoco
 import numpy as np
 import pydantic
 
-from clamber.errors import InputError
+from clamber.errors import InputError, read_yaml, validated
 from clamber.model.description import Description, compile_description, read_description
 from clamber.model.records import short_repr
-from clamber.model.scene import input_error, read_yaml
 
 ROBOTS = Path(__file__).parent / "robots"
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
@@ -151,10 +150,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
             source="--robot",
             value=str(path),
         )
-    try:
-        file = RobotFile.model_validate(read_yaml(path))
-    except pydantic.ValidationError as e:
-        raise input_error(e, path) from e
+    file = validated(RobotFile, read_yaml(path), path)
     missing = set(LIMBS) - set(file.limbs)
     if missing:
         raise InputError(

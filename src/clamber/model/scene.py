@@ -1,31 +1,82 @@
 """The scene: a ground plane and boxes, whose flat tops are the supports.
 
 A `Support` frame P has its origin in the middle of the surface and z along the outward
-normal; its convex polygon is given in that frame's x and y, counter-clockwise.
+normal; its convex polygon is given in that frame's x and y, counter-clockwise. Files
+are read by `clamber.model.terrain`.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import pydantic
-import yaml
 
-from clamber.errors import InputError, unreadable
+from clamber.errors import InputError
 from clamber.model.records import frozen_array, short_repr
 from clamber.model.se3 import matrix_from_rpy
-from clamber.model.terrain import NAME, read_drawn_boxes
 
 GROUND = "ground"
-DRAWN = (".obj", ".xml")  # files of boxes
 GROUND_HALF_SIZE = 20.0  # [m] the ground is a support of this half width
 NEAR_FACE = 0.23  # [m] from the ankles' midpoint to the box of `Scene.from_height`
 MAX_LENGTH = 50.0  # [m] a larger box is a wrong unit
+_ROUNDING = 1e-9  # [m]
+
+
+def length(x: float) -> float:
+    """A positive, finite length [m].
+
+    Raises:
+        ValueError: It is none.
+    """
+    if finite(x) <= 0:
+        raise ValueError("expected a positive length [m]")
+    return x
+
+
+def finite(x: float) -> float:
+    """A finite number in metres or radians.
+
+    Raises:
+        ValueError: It is none, or so large that it must be in another unit.
+    """
+    if not math.isfinite(x):
+        raise ValueError("expected a finite number")
+    if abs(x) > MAX_LENGTH:
+        raise ValueError(
+            f"expected metres or radians, at most {MAX_LENGTH:g}: is it in millimetres?"
+        )
+    return x
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Edge:
+    """A line along which a support ends, where it is climbed.
+
+    Attributes:
+        point: (3,) on it, in the world [m].
+        inward: (2,) horizontal unit normal, towards the support.
+    """
+
+    point: np.ndarray
+    inward: np.ndarray
+
+    __repr__ = short_repr
+
+    def distance(self, p: np.ndarray) -> float:
+        """How far a world point (2,) or (3,) is behind the line [m]."""
+        return float((p[:2] - self.point[:2]) @ self.inward)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(3, 3) R_WE of the edge frame E: x inwards, z up."""
+        x, y = self.inward
+        return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+
+    @property
+    def yaw(self) -> float:
+        """Of the edge frame in the world [rad]."""
+        return math.atan2(self.inward[1], self.inward[0])
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -48,6 +99,7 @@ class Support:
     friction: float
     normal: np.ndarray = field(init=False)
     _half_planes: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False)
+    _half_sizes: np.ndarray | None = field(init=False, repr=False)
 
     __repr__ = short_repr
 
@@ -58,15 +110,27 @@ class Support:
         object.__setattr__(self, "normal", frozen_array(self.rotation[:, 2], (3,)))
         object.__setattr__(self, "polygon", frozen_array(self.polygon, (-1, 2)))
         edges = np.roll(self.polygon, -1, axis=0) - self.polygon
-        nxt = np.roll(edges, -1, axis=0)
-        if np.any(edges[:, 0] * nxt[:, 1] - edges[:, 1] * nxt[:, 0] <= 0):
+        before = np.roll(edges, 1, axis=0)
+        turns = before[:, 0] * edges[:, 1] - before[:, 1] * edges[:, 0]
+        if len(edges) < 3 or np.any(turns <= 0):
             raise ValueError(f"support {self.name}: polygon is not convex, ccw")
         out = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
         out /= np.linalg.norm(out, axis=1, keepdims=True)
         b = np.sum(out * self.polygon, axis=1)
+        if np.any(self.polygon @ out.T > b + _ROUNDING):  # more than once around
+            raise ValueError(f"support {self.name}: polygon is not convex, it winds")
         A = out @ self.rotation[:, :2].T
-        planes = frozen_array(A, (-1, 3)), frozen_array(b + A @ self.position, (-1,))
+        planes = frozen_array(A), frozen_array(b + A @ self.position)
         object.__setattr__(self, "_half_planes", planes)
+        x, y = half = self.polygon.max(axis=0)
+        rectangle = [[-x, -y], [x, -y], [x, y], [-x, y]]
+        is_rectangle = np.array_equal(self.polygon, rectangle)
+        object.__setattr__(self, "_half_sizes", half if is_rectangle else None)
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """(K, 3) of the polygon in the world, counter-clockwise seen from outside."""
+        return self.position + self.polygon @ self.rotation[:, :2].T
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (...,) of world points (..., 3) over the plane [m]."""
@@ -84,6 +148,84 @@ class Support:
         """Whether world points (..., 3) project at least `margin` inside [m]."""
         A, b = self.edges()
         return np.all(points @ A.T <= b - margin, axis=-1)
+
+    def level(self, points: np.ndarray) -> np.ndarray:
+        """Height z (...,) of the plane above or below world points (..., 2 or 3) [m].
+
+        A wall, whose normal is level, has none.
+        """
+        n, off = self.normal, points[..., :2] - self.position[:2]
+        return self.position[2] - off @ n[:2] / n[2]
+
+    def nearest(self, point: np.ndarray, inset: float = 0.0) -> np.ndarray:
+        """The nearest point (3,) of the support, `inset` [m] away from its border.
+
+        Where the support is too narrow for that, on its middle; a rectangle is narrow
+        along each of its sides alone.
+
+        Args:
+            point: (3,) in the world [m].
+            inset: From the border inwards [m].
+        """
+        local = self.rotation.T @ (point - self.position)
+        if self._half_sizes is not None:
+            half = np.maximum(self._half_sizes - inset, 0.0)
+            x, y = np.clip(local[:2], -half, half)
+        else:
+            x, y = self._nearest_in_polygon(local[:2], inset)
+        return self.position + self.rotation @ np.array([x, y, 0.0])
+
+    def _nearest_in_polygon(self, p: np.ndarray, inset: float) -> np.ndarray:
+        """(2,) of the shrunk polygon, in P: `p`, on one side of it, or a corner."""
+        edges = np.roll(self.polygon, -1, axis=0) - self.polygon
+        A = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+        A /= np.linalg.norm(A, axis=1, keepdims=True)
+        b = np.sum(A * self.polygon, axis=1) - inset
+        candidates = [p, *(p - (A @ p - b)[:, None] * A)]
+        for i in range(len(A)):
+            for j in range(i):
+                if abs(A[i, 0] * A[j, 1] - A[i, 1] * A[j, 0]) > _ROUNDING:
+                    candidates.append(np.linalg.solve(A[[i, j]], b[[i, j]]))
+        q = np.array(candidates)
+        q = q[np.all(q @ A.T <= b + _ROUNDING, axis=1)]
+        if len(q) == 0:
+            return self._nearest_in_polygon(p, self._depth() - _ROUNDING)
+        return q[np.argmin(np.linalg.norm(q - p, axis=1))]
+
+    def _depth(self) -> float:
+        """The largest distance that a point of the polygon has to its border [m]."""
+        from scipy.optimize import linprog  # slow to import, and rarely needed
+
+        A, b = self.edges()
+        rows = np.column_stack([A @ self.rotation[:, :2], np.ones(len(b))])
+        b = b - A @ self.position
+        found = linprog([0.0, 0.0, -1.0], rows, b, bounds=(None, None))
+        return float(found.x[2])
+
+    def edge_towards(self, point: np.ndarray) -> Edge:
+        """The edge that is nearest to a place, seen from above, there where it is.
+
+        Abreast of a corner, the edge that faces the place more.
+
+        Args:
+            point: (2,) or (3,) in the world [m].
+        """
+        start, corners = point[:2], self.vertices
+        best, out = (math.inf, 0.0), None
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            span = float(np.linalg.norm((b - a)[:2]))
+            if span < _ROUNDING:  # upright, of a wall
+                continue
+            along = (b - a)[:2] / span
+            s = float(np.clip((start - a[:2]) @ along, 0.0, span))
+            foot = a[:2] + s * along
+            inward = np.array([-along[1], along[0]])  # ccw: inside lies to the left
+            score = float(np.linalg.norm(foot - start)), float((start - a[:2]) @ inward)
+            if score < best:
+                z = a[2] + (b[2] - a[2]) * s / span
+                best, out = score, Edge(point=np.array([*foot, z]), inward=inward)
+        assert out is not None  # a polygon has an area
+        return out
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -177,6 +319,23 @@ class Scene:
         """Ground first, then the tops of the boxes in order."""
         return (self.ground, *(b.top for b in self.boxes))
 
+    def below(self, point: np.ndarray, slack: float = 0.0) -> Support | None:
+        """The highest support under a point (3,); None where there is none.
+
+        Args:
+            point: In the world [m].
+            slack: A support that ends so far beside the point, or is so far above it,
+                is under it as well [m].
+        """
+        under = []
+        for s in self.supports:
+            if s.normal[2] > _ROUNDING:
+                z = float(s.level(point))
+                foot = np.array([point[0], point[1], z])
+                if z <= point[2] + slack and s.inside(foot, -slack):
+                    under.append((z, s))
+        return max(under, key=lambda x: x[0])[1] if under else None
+
     def support(self, name: str) -> Support:
         """The support of that name; KeyError lists those that exist."""
         for s in self.supports:
@@ -188,225 +347,24 @@ class Scene:
 
     @classmethod
     def from_height(cls, height: float, friction: float = 0.8) -> Scene:
-        """One box of 1.0 x 1.2 x height m, its near face 0.23 m from the ankles."""
-        return SceneFile.model_validate(
-            {
-                "ground": {"friction": friction},
-                "boxes": [
-                    {
-                        "name": "box",
-                        "size": [1.0, 1.2, height],
-                        "position": [NEAR_FACE + 0.5, 0.0],
-                        "friction": friction,
-                    }
-                ],
-            }
-        ).scene()
-
-
-def _finite(x: float) -> float:
-    if not math.isfinite(x):
-        raise ValueError("expected a finite number")
-    if abs(x) > MAX_LENGTH:
-        raise ValueError(
-            f"expected metres or radians, at most {MAX_LENGTH:g}: is it in millimetres?"
-        )
-    return x
-
-
-def _positive(x: float) -> float:
-    if x <= 0:
-        raise ValueError("expected a positive length [m]")
-    return x
-
-
-Number = Annotated[float, pydantic.AfterValidator(_finite)]
-Length = Annotated[
-    float, pydantic.AfterValidator(_finite), pydantic.AfterValidator(_positive)
-]
-Friction = Annotated[float, pydantic.Field(gt=0.0, le=1.0)]
-Roughness = Annotated[float, pydantic.Field(ge=0.0, le=0.1)]
-
-
-class _Strict(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(extra="forbid")
-
-
-class GroundFile(_Strict):
-    """`ground` of a scene file."""
-
-    friction: Friction = 0.8
-
-
-class BoxFile(_Strict):
-    """One of `boxes` of a scene file."""
-
-    name: str = pydantic.Field(pattern=NAME)
-    size: tuple[Length, Length, Length]
-    position: tuple[Number, Number] | tuple[Number, Number, Number]
-    rpy: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
-    friction: Friction = 0.8
-    roughness: Roughness = 0.0
-
-
-class SceneFile(_Strict):
-    """A scene as a person writes it (`scene.yaml`).
-
-    `boxes` may be the name of an OBJ or MJCF file beside it; `friction` is then that of
-    boxes which the file gives none.
-    """
-
-    version: int = 1
-    ground: GroundFile = GroundFile()
-    boxes: list[BoxFile] | str = []
-    friction: Friction = 0.8
-    start: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
-    goal: tuple[Number, Number] | tuple[Number, Number, Number] | None = None
-
-    @pydantic.field_validator("boxes")
-    @classmethod
-    def _unique(cls, boxes: list[BoxFile] | str) -> list[BoxFile] | str:
-        if isinstance(boxes, str):
-            return boxes
-        names = [b.name for b in boxes] + [GROUND]
-        if len(set(names)) != len(names):
-            raise ValueError(f"expected different names, none of them {GROUND!r}")
-        return boxes
-
-    def scene(self, folder: Path = Path()) -> Scene:
-        """The record; files that it names are in `folder`.
+        """One box of 1.0 x 1.2 x height m, its near face 0.23 m from the ankles.
 
         Raises:
-            InputError: A file that it names cannot be used.
+            InputError: The height is no positive length, or the friction not from 0
+                to 1.
         """
-        if isinstance(self.boxes, str):
-            boxes, friction = drawn_boxes(folder / self.boxes, self.friction)
-            if friction is None or "friction" in self.ground.model_fields_set:
-                friction = self.ground.friction
-            return Scene(
-                boxes=boxes,
-                ground_friction=friction,
-                start=np.array(self.start),
-                goal=None if self.goal is None else np.array(self.goal),
-            )
-        boxes = []
-        for b in self.boxes:
-            bottom = b.position[2] if len(b.position) == 3 else 0.0
-            centre = [b.position[0], b.position[1], bottom + b.size[2] / 2]
-            boxes.append(
-                Box(
-                    name=b.name,
-                    size=np.array(b.size),
-                    position=np.array(centre),
-                    rotation=matrix_from_rpy(b.rpy),
-                    friction=b.friction,
-                    roughness=b.roughness,
-                )
-            )
-        return Scene(
-            boxes=tuple(boxes),
-            ground_friction=self.ground.friction,
-            start=np.array(self.start),
-            goal=None if self.goal is None else np.array(self.goal),
+        try:
+            size = np.array([1.0, 1.2, length(height)])
+        except ValueError as e:
+            text = str(e).removeprefix("expected ")
+            raise InputError(text, None, "height", height) from e
+        if not 0 < friction <= 1:
+            raise InputError("above 0, at most 1", None, "friction", friction)
+        box = Box(
+            name="box",
+            size=size,
+            position=np.array([NEAR_FACE + 0.5, 0.0, height / 2]),
+            rotation=matrix_from_rpy([0.0, 0.0, 0.0]),
+            friction=friction,
         )
-
-
-def drawn_boxes(path: Path, friction: float) -> tuple[tuple[Box, ...], float | None]:
-    """Boxes of an OBJ or MJCF, and the friction of the ground where it has one.
-
-    Args:
-        path: The file.
-        friction: Of boxes of which it says none.
-
-    Raises:
-        InputError: It cannot be read, or a box of it cannot be used.
-    """
-    drawn, ground = read_drawn_boxes(path)
-    names = [b.name for b in drawn]
-    for b in drawn:
-        fault = None
-        if names.count(b.name) > 1 or b.name == GROUND or not re.match(NAME, b.name):
-            fault = f"a name of its own of letters, digits and _, not {GROUND!r}"
-        elif max(np.abs(b.size).max(), np.abs(b.position).max()) > MAX_LENGTH:
-            fault = f"metres, at most {MAX_LENGTH:g}: is it in millimetres?"
-        elif b.friction is not None and not 0 < b.friction <= 1:
-            fault = f"a friction above 0, at most 1, not {b.friction:g}"
-        if fault:
-            raise InputError(fault, source=path, field=f"box {b.name!r}")
-    boxes = tuple(
-        Box(
-            name=b.name,
-            size=b.size,
-            position=b.position,
-            rotation=b.rotation,
-            friction=friction if b.friction is None else b.friction,
-        )
-        for b in drawn
-    )
-    if ground is not None and not 0 < ground <= 1:
-        raise InputError(
-            "a friction above 0, at most 1", source=path, field="ground", value=ground
-        )
-    return boxes, ground
-
-
-def input_error(error: pydantic.ValidationError, source: object) -> InputError:
-    """The first fault of a validation as one sentence with file, field and value."""
-    first = error.errors()[0]
-    # Where a field may be one of two shapes, pydantic adds the shape to the path.
-    where = ".".join(
-        x
-        for x in map(str, first["loc"])
-        if not x.startswith(("tuple[", "union[", "list["))
-    )
-    text = first["msg"].removeprefix("Value error, ").removeprefix("expected ")
-    text = text.removeprefix("Input should be ")
-    value = first.get("input")
-    if first["type"] == "missing":
-        text, value = "a value: it is missing", None
-    elif first["type"] == "extra_forbidden":
-        text = "no such field: mend its name, or leave it out"
-    if not where:  # the fields together are wrong: their values are no help
-        return InputError(text, source=source)
-    return InputError(text, source=source, field=where, value=value)
-
-
-def read_yaml(path: Path) -> dict:
-    """A YAML mapping from disk.
-
-    Raises:
-        InputError: The file is missing, unreadable or no mapping.
-    """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as e:
-        raise unreadable(path, e) from e
-    except (yaml.YAMLError, UnicodeDecodeError) as e:
-        raise InputError(f"YAML ({_fault(e)})", source=path) from e
-    if not isinstance(content, dict):
-        raise InputError(
-            "a mapping of fields", source=path, value=type(content).__name__
-        )
-    return content
-
-
-def _fault(error: yaml.YAMLError | UnicodeDecodeError) -> str:
-    """What is wrong with a YAML file, and in which line."""
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        return f"line {error.problem_mark.line + 1}: {error.problem}"
-    return str(error).splitlines()[0]
-
-
-def load_scene(path: str | Path) -> Scene:
-    """Read a `scene.yaml`, or the boxes of an OBJ or MJCF (`.xml`).
-
-    Raises:
-        InputError: The file or one of its fields cannot be used.
-    """
-    path = Path(path)
-    try:
-        if path.suffix.lower() in DRAWN:
-            return SceneFile(boxes=path.name).scene(path.parent)
-        return SceneFile.model_validate(read_yaml(path)).scene(path.parent)
-    except pydantic.ValidationError as e:
-        raise input_error(e, path) from e
+        return cls(boxes=(box,), ground_friction=friction, start=np.zeros(3))

@@ -1,55 +1,164 @@
-"""Boxes of a drawing: OBJ with eight vertices a box, or the fixed boxes of an MJCF."""
+"""Files of a scene -> `Scene`: a scene.yaml, or the boxes of a drawing.
+
+A drawing is an OBJ with eight vertices a box, or the fixed boxes of an MJCF.
+"""
 
 from __future__ import annotations
 
 import itertools
 import re
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import numpy as np
+import pydantic
 
-from clamber.errors import InputError, unreadable
+from clamber.errors import InputError, read_yaml, unreadable, validated
 from clamber.model.description import compile_description, read_description
+from clamber.model.scene import GROUND, MAX_LENGTH, Box, Scene, finite, length
 from clamber.model.se3 import matrix_from_rpy
 
 NAME = r"^[A-Za-z][A-Za-z0-9_]*$"  # of a box
+DRAWN = (".obj", ".xml")  # files of boxes
+DEFAULT_FRICTION = 0.8
 _LARGEST = 1e6  # [m]
 _FIT = 2e-3  # [m] a vertex further than this from the fitted box is no box's
 
+Number = Annotated[float, pydantic.AfterValidator(finite)]
+Length = Annotated[float, pydantic.AfterValidator(length)]
+Friction = Annotated[float, pydantic.Field(gt=0.0, le=1.0)]
+Roughness = Annotated[float, pydantic.Field(ge=0.0, le=0.1)]
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class DrawnBox:
-    """A box as it is drawn.
 
-    Attributes:
-        name: Its own, or `box1`, `box2` and so on.
-        size: (3,) full lengths [m].
-        position: (3,) centre in the world [m].
-        rotation: (3, 3) R_WB.
-        friction: Coulomb coefficient; None where the drawing says none.
+class _Strict(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+
+class GroundFile(_Strict):
+    """`ground` of a scene file."""
+
+    friction: Friction = 0.8
+
+
+class BoxFile(_Strict):
+    """One of `boxes` of a scene file."""
+
+    name: str = pydantic.Field(pattern=NAME)
+    size: tuple[Length, Length, Length]
+    position: tuple[Number, Number] | tuple[Number, Number, Number]
+    rpy: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    friction: Friction = 0.8
+    roughness: Roughness = 0.0
+
+    def box(self) -> Box:
+        """The record."""
+        x, y, *z = self.position
+        bottom = z[0] if z else 0.0
+        return Box(
+            name=self.name,
+            size=np.array(self.size),
+            position=np.array([x, y, bottom + self.size[2] / 2]),
+            rotation=matrix_from_rpy(self.rpy),
+            friction=self.friction,
+            roughness=self.roughness,
+        )
+
+
+class SceneFile(_Strict):
+    """A scene as a person writes it (`scene.yaml`).
+
+    `boxes` may be the name of an OBJ or MJCF file beside it; `friction` is then that of
+    boxes which the file gives none.
     """
 
-    name: str
-    size: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
-    friction: float | None = None
+    version: int = 1
+    ground: GroundFile = GroundFile()
+    boxes: list[BoxFile] | str = []
+    friction: Friction = 0.8
+    start: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    goal: tuple[Number, Number] | tuple[Number, Number, Number] | None = None
+
+    @pydantic.field_validator("boxes")
+    @classmethod
+    def _unique(cls, boxes: list[BoxFile] | str) -> list[BoxFile] | str:
+        if isinstance(boxes, str):
+            return boxes
+        names = [b.name for b in boxes] + [GROUND]
+        if len(set(names)) != len(names):
+            raise ValueError(f"expected different names, none of them {GROUND!r}")
+        return boxes
+
+    def scene(self, folder: Path = Path()) -> Scene:
+        """The record; files that it names are in `folder`.
+
+        Raises:
+            InputError: A file that it names cannot be used.
+        """
+        friction = self.ground.friction
+        if isinstance(self.boxes, str):
+            boxes, drawn = read_boxes(folder / self.boxes, self.friction)
+            if drawn is not None and "friction" not in self.ground.model_fields_set:
+                friction = drawn
+        else:
+            boxes = [b.box() for b in self.boxes]
+        return Scene(
+            boxes=tuple(boxes),
+            ground_friction=friction,
+            start=np.array(self.start),
+            goal=None if self.goal is None else np.array(self.goal),
+        )
 
 
-def read_drawn_boxes(path: Path) -> tuple[list[DrawnBox], float | None]:
-    """Boxes of an OBJ [m, z up] or MJCF, and the friction of the ground in it.
+def load_scene(path: str | Path) -> Scene:
+    """Read a `scene.yaml`, or the boxes of an OBJ or MJCF (`.xml`).
 
     Raises:
-        InputError: It is neither, or holds no box.
+        InputError: The file or one of its fields cannot be used.
+    """
+    path = Path(path)
+    drawn = path.suffix.lower() in DRAWN
+    content = {"boxes": path.name} if drawn else read_yaml(path)
+    return validated(SceneFile, content, path).scene(path.parent)
+
+
+def read_boxes(path: Path, friction: float) -> tuple[list[Box], float | None]:
+    """Boxes of an OBJ or MJCF, and the friction of the ground where it has one.
+
+    Args:
+        path: The file.
+        friction: Of boxes of which it says none.
+
+    Raises:
+        InputError: It cannot be read, or a box of it cannot be used.
     """
     if path.suffix.lower() == ".obj":
-        return read_obj(path), None
-    return read_mjcf_boxes(path)
+        boxes, ground = read_obj(path, friction=friction), None
+    else:
+        boxes, ground = read_mjcf_boxes(path)
+    names = [b.name for b in boxes]
+    for b in boxes:
+        fault = None
+        if names.count(b.name) > 1 or b.name == GROUND or not re.match(NAME, b.name):
+            fault = f"a name of its own of letters, digits and _, not {GROUND!r}"
+        elif max(np.abs(b.size).max(), np.abs(b.position).max()) > MAX_LENGTH:
+            fault = f"metres, at most {MAX_LENGTH:g}: is it in millimetres?"
+        elif not 0 < b.friction <= 1:
+            fault = f"a friction above 0, at most 1, not {b.friction:g}"
+        if fault:
+            raise InputError(fault, path, f"box {b.name!r}")
+    if ground is not None and not 0 < ground <= 1:
+        raise InputError("a friction above 0, at most 1", path, "ground", ground)
+    return boxes, ground
 
 
-def read_obj(path: Path, scale: float = 1.0, up: str = "z") -> list[DrawnBox]:
+def read_obj(
+    path: Path,
+    scale: float = 1.0,
+    up: str = "z",
+    friction: float = DEFAULT_FRICTION,
+) -> list[Box]:
     """Boxes of an OBJ in the order of the file.
 
     An object (`o` or `g`) of eight vertices gives its box its name; a file without
@@ -59,6 +168,7 @@ def read_obj(path: Path, scale: float = 1.0, up: str = "z") -> list[DrawnBox]:
         path: The file.
         scale: Metres per unit.
         up: The axis that points up in it.
+        friction: Of the boxes.
 
     Raises:
         InputError: It is no such file.
@@ -69,7 +179,7 @@ def read_obj(path: Path, scale: float = 1.0, up: str = "z") -> list[DrawnBox]:
     except OSError as e:
         raise unreadable(path, e) from e
     except UnicodeDecodeError as e:
-        raise InputError("an OBJ file, in UTF-8", source=path) from e
+        raise InputError("an OBJ file, in UTF-8", path) from e
     for number, line in enumerate(lines, start=1):
         word, *rest = line.split() or [""]
         if word in ("o", "g") and rest:
@@ -80,20 +190,19 @@ def read_obj(path: Path, scale: float = 1.0, up: str = "z") -> list[DrawnBox]:
             except ValueError:
                 x = []
             if len(x) != 3 or not np.all(np.isfinite(x)):
-                raise InputError(
-                    "three finite numbers", source=path, field=f"line {number}"
-                )
+                raise InputError("three finite numbers", path, f"line {number}")
             groups[-1][1].append(x)
-    boxes: list[DrawnBox] = []
+    boxes: list[Box] = []
     groups = [(name, v) for name, v in groups if v]
     if not groups or any(len(v) % 8 for _, v in groups):
         count = sum(len(v) for _, v in groups)
-        raise InputError("8 vertices a box", source=path, field="v", value=count)
+        raise InputError("8 vertices a box", path, "v", count)
     for name, vertices in groups:
         v = to_z_up(scale * np.array(vertices), up)
         for k in range(0, len(v), 8):
             single = name if name is not None and len(v) == 8 else None
-            boxes.append(_fit_box(single or f"box{len(boxes) + 1}", v[k : k + 8], path))
+            box = _fit_box(single or f"box{len(boxes) + 1}", v[k : k + 8], path)
+            boxes.append(replace(box, friction=friction))
     return boxes
 
 
@@ -113,7 +222,7 @@ def to_z_up(x: np.ndarray, up: str) -> np.ndarray:
     return np.stack([sign * x[..., k] for k, sign in AXES[up]], axis=-1)
 
 
-def _fit_box(name: str, v: np.ndarray, path: Path) -> DrawnBox:
+def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
     """The box (8, 3) vertices belong to, in any order: upright if it can be."""
     order = np.argsort(v[:, 2], kind="stable")
     base = v[order[:4]]
@@ -132,12 +241,10 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> DrawnBox:
         raise InputError(
             "8 vertices of a box "
             f"(one is {off:.3f} m off; size {(high - low).round(3).tolist()})",
-            source=path,
-            field=name,
+            path,
+            name,
         )
-    return DrawnBox(
-        name=name, size=high - low, position=R @ (low + high) / 2, rotation=R
-    )
+    return Box(name=name, size=high - low, position=R @ (low + high) / 2, rotation=R)
 
 
 def _extent(v: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -179,7 +286,7 @@ def _tilted(v: np.ndarray) -> np.ndarray | None:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def read_mjcf_boxes(path: Path) -> tuple[list[DrawnBox], float | None]:
+def read_mjcf_boxes(path: Path) -> tuple[list[Box], float | None]:
     """Box geoms of an MJCF that are fixed to the world, and its plane's friction.
 
     Raises:
@@ -200,16 +307,12 @@ def read_mjcf_boxes(path: Path) -> tuple[list[DrawnBox], float | None]:
             ground = float(model.geom_friction[g, 0])
             continue
         if kind != mujoco.mjtGeom.mjGEOM_BOX:
-            raise InputError(
-                "boxes and a plane",
-                source=path,
-                field=f"geom {name!r}",
-                value=kind.name.removeprefix("mjGEOM_").lower(),
-            )
+            what = kind.name.removeprefix("mjGEOM_").lower()
+            raise InputError("boxes and a plane", path, f"geom {name!r}", what)
         if not re.match(NAME, name):
             name = f"box{len(boxes) + 1}"
         boxes.append(
-            DrawnBox(
+            Box(
                 name=name,
                 size=2.0 * model.geom_size[g],
                 position=data.geom_xpos[g].copy(),
@@ -218,5 +321,5 @@ def read_mjcf_boxes(path: Path) -> tuple[list[DrawnBox], float | None]:
             )
         )
     if not boxes:
-        raise InputError("a box that is fixed to the world", source=path, field="geom")
+        raise InputError("a box that is fixed to the world", path, "geom")
     return boxes, ground

@@ -16,11 +16,8 @@ _THIN = 1e-3  # [m] what rises less above the ground is part of it
 
 
 def read_obj_boxes(path: Path, scale: float = 1.0, up: str = "z") -> list[Box]:
-    """Boxes of an OBJ in the order of the file; see `clamber.boxes.read_obj`."""
-    return [
-        Box(name=b.name, size=b.size, position=b.position, rotation=b.rotation)
-        for b in read_obj(path, scale, up)
-    ]
+    """Boxes of an OBJ in the order of the file; see `read_obj`."""
+    return read_obj(path, scale, up)
 
 
 def lower_to_ground(boxes: list[Box], ground: str, source: object) -> tuple:

@@ -16,10 +16,10 @@ from typing import Annotated, Literal
 import numpy as np
 import pydantic
 
-from clamber.errors import InputError, unreadable
-from clamber.model.scene import Box, Scene, input_error, load_scene, read_yaml
+from clamber.errors import InputError, read_yaml, unreadable, validated
+from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_quat
-from clamber.model.terrain import to_z_up
+from clamber.model.terrain import load_scene, to_z_up
 from clamber.recording import arrays, bvh, c3d, motive, trc
 from clamber.recording.boxes import FLOOR, lower_to_ground, read_obj_boxes
 from clamber.recording.demonstration import (
@@ -144,10 +144,7 @@ def load_recording(
         else:
             listed = None if names is None else str(Path(names).absolute())
         given = {"file": path.name, "names": listed, "rate": rate}
-    try:
-        said = RecordingFile.model_validate(given)
-    except pydantic.ValidationError as e:
-        raise input_error(e, path) from e
+    said = validated(RecordingFile, given, path)
     demo = _build(path, said, scene=scene, span=span or said.span)
     return fit_levels(demo) if fit_floor else demo
 

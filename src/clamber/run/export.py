@@ -21,10 +21,9 @@ from typing import Any, Literal, get_args
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError, MissingDependency
+from clamber.errors import InputError, MissingDependency, read_yaml
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
-from clamber.model.scene import read_yaml
 from clamber.model.world import World
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import RATE, Trajectory, holding_torque

@@ -43,13 +43,13 @@ from clamber.contact.policy import (
     Place,
 )
 from clamber.contact.steps import Skipped
-from clamber.errors import InputError, Status, unreadable
+from clamber.errors import InputError, Status, input_error, read_yaml, unreadable
 from clamber.execution.executive import Event
 from clamber.execution.simulation import Criterion, Rollout, Verdict
 from clamber.model.kinematics import Kinematics
 from clamber.model.propose import Proposal, robot_yaml
 from clamber.model.robot import LIMBS, ROBOTS, Limb, Robot, RobotFile
-from clamber.model.scene import Box, Scene, input_error, read_yaml
+from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import World, index_world
 from clamber.planning.records import Iteration, Midway, Plan, PlanOptions

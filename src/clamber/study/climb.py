@@ -15,12 +15,13 @@ from typing import Any, Literal
 
 import pydantic
 
-from clamber.errors import InputError
+from clamber.errors import InputError, input_error
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.servo import ControlMode
 from clamber.execution.simulation import DEFAULT_CONTROLLER, judge, simulate
 from clamber.model.robot import load_robot
-from clamber.model.scene import Scene, input_error, load_scene
+from clamber.model.scene import Scene
+from clamber.model.terrain import load_scene
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.free import Bounds
 from clamber.planning.planner import plan
@@ -147,9 +148,8 @@ def scene_of(height: float | None, path: str | Path | None) -> Scene:
     assert height is not None
     try:
         return Scene.from_height(height)
-    except pydantic.ValidationError as e:
-        expected = input_error(e, None).expected
-        raise InputError(expected, source="--height", value=height) from e
+    except InputError as e:
+        raise InputError(e.expected, "--height", value=height) from e
 
 
 def run_job(job: Job) -> Outcome:

@@ -18,9 +18,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pydantic
 
-from clamber.errors import InputError
+from clamber.errors import InputError, input_error, read_yaml
 from clamber.execution.servo import ControlMode
-from clamber.model.scene import input_error, read_yaml
 from clamber.study.climb import FLAGS, Job, Outcome, job_of
 
 SEED = "disturb.seed"

@@ -26,7 +26,7 @@ import yaml
 
 from clamber.errors import ClamberError, InputError, MissingDependency, unreadable
 from clamber.model.robot import load_robot
-from clamber.model.scene import load_scene
+from clamber.model.terrain import load_scene
 from clamber.recording.library import load_demo
 from clamber.run.folder import whole_file
 from clamber.study.climb import Outcome, command_of, run_job
