@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from clamber.step.statics import (
+    ContactPoints,
+    Load,
     com_margin,
     contact_forces,
     is_statically_stable,
@@ -27,17 +30,16 @@ from clamber.step.statics import (
 STANCES = 1000
 MASS = 30.0  # [kg]
 
-StanceArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
-
-def random_stance(rng: np.random.Generator) -> StanceArrays:
+def random_stance(rng: np.random.Generator) -> tuple[ContactPoints, np.ndarray]:
     """2 to 8 points, tilted normals, mu from 0.2 to 1, a centre of mass near."""
     nc = int(rng.integers(2, 9))
     points = rng.uniform(-0.4, 0.4, (nc, 3)) * [1.0, 1.0, 0.5]
     normals = np.c_[rng.normal(0.0, 0.35, (nc, 2)), np.ones(nc)]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     com = np.append(points[:, :2].mean(axis=0) + rng.normal(0.0, 0.08, 2), 0.5)
-    return points, normals, rng.uniform(0.2, 1.0, nc), com
+    mu, names = rng.uniform(0.2, 1.0, nc), [""] * nc
+    return ContactPoints(points=points, normals=normals, mu=mu, names=names), com
 
 
 def timed(job: Callable, inputs: Sequence) -> tuple[float, list]:
@@ -57,7 +59,8 @@ def main() -> None:
     print(f"{STANCES} stances of 2 to 8 points; median time of a call")
     for edges in (4, 8):
         ours, verdicts = timed(
-            lambda s, m=edges: is_statically_stable(*s, cone_edges=m), stances
+            lambda s: is_statically_stable(*s),
+            [(replace(c, cone_edges=edges), com) for c, com in stances],
         )
         print(f"balance test, {edges} edges: clamber {ours:8.1f} us", end="")
         try:
@@ -66,17 +69,17 @@ def main() -> None:
             print("   (pip install klampt compares)")
             continue
         robotsim.set_friction_cone_approximation_edges(edges)
-        inputs = [(np.c_[p, n, mu], tuple(com)) for p, n, mu, com in stances]
+        inputs = [(np.c_[c.points, c.normals, c.mu], tuple(com)) for c, com in stances]
         theirs, answers = timed(
             lambda s: robotsim.com_equilibrium(s[0], (0, 0, -1), s[1]), inputs
         )
         same = sum(a == (b is not None) for a, b in zip(verdicts, answers, strict=True))
         print(f"   Klampt {theirs:8.1f} us   {same} of {STANCES} agree")
 
-    few = stances[:100]
-    us, _ = timed(lambda s: contact_forces(*s, MASS), stances)
+    loads = [(c, Load(com=com, mass=MASS)) for c, com in stances]
+    us, _ = timed(lambda s: contact_forces(*s), loads)
     print(f"contact_forces:            {us:8.1f} us")
-    us, _ = timed(lambda s: static_equilibrium(*s, MASS, names=[""] * len(s[0])), few)
+    us, _ = timed(lambda s: static_equilibrium(*s), loads[:100])
     print(f"static_equilibrium:        {us:8.1f} us")
     clouds = [rng.uniform(-0.4, 0.4, (16, 2)) for _ in range(STANCES)]
     us, polygons = timed(support_polygon, clouds)

@@ -27,7 +27,7 @@ from clamber.planning.adaptation import (
 from clamber.planning.records import Midway
 from clamber.planning.trajectory import HOLD_START, RATE, holding_torque
 from clamber.step.ik import IK
-from clamber.step.posture import bearing_frames, contact_drift
+from clamber.step.stability import contact_drift, contact_points
 from clamber.step.statics import com_margin, support_polygon
 
 STEPS = range(6)
@@ -113,7 +113,7 @@ def test_feeling_keeps_held_contacts_and_balance(demo_plan, step):
     for x in t.q[::40]:
         kin.update(x)
         assert max(contact_drift(kin, c) for c in held) < 5e-4
-        polygon = support_polygon(bearing_frames(kin, held)[1][:, :2])
+        polygon = support_polygon(contact_points(kin, held).points[:, :2])
         assert com_margin(kin.com[:2], polygon) > 0.005
         # Between postures at a limit the spline may pass it by a fifth of a degree.
         assert np.all(x[world.qadr] >= world.q_min[world.dadr] - 3.5e-3)

@@ -27,7 +27,7 @@ from clamber.planning.free import (
 from clamber.planning.records import PlanOptions
 from clamber.step.change import standing
 from clamber.step.ik import IK
-from clamber.step.posture import contact_drift
+from clamber.step.stability import contact_drift
 
 
 @pytest.fixture(scope="module")

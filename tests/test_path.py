@@ -23,7 +23,8 @@ from clamber.step.path import (
     overlap,
     plan_path,
 )
-from clamber.step.posture import CLEARANCE, bearing_frames, contact_drift
+from clamber.step.posture import CLEARANCE
+from clamber.step.stability import contact_drift, contact_points
 from clamber.step.statics import com_margin, support_polygon
 
 
@@ -196,7 +197,7 @@ def test_the_centre_of_mass_stays_over_the_contacts_that_bear_load(
             load = {c.surface: c for c in (*phase.load_before, *phase.load_after)}
             for q in phase.q:
                 demo_kinematics.update(q)
-                points = bearing_frames(demo_kinematics, tuple(load.values()))[1]
+                points = contact_points(demo_kinematics, tuple(load.values())).points
                 polygon = support_polygon(points[:, :2])
                 assert com_margin(demo_kinematics.com, polygon) > 5e-3
 

@@ -26,7 +26,7 @@ from clamber.planning.trajectory import (
     build_trajectory,
     holding_torque,
 )
-from clamber.step.posture import bearing_frames
+from clamber.step.stability import contact_points, point_jacobians
 from clamber.step.statics import cone_generators
 
 
@@ -98,15 +98,10 @@ def holds(kin, q, force, contacts, effort: float) -> bool:
     """Whether cones and efforts can bring up a generalised force: an LP of its own."""
     w = kin.world
     kin.update(q)
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    cones = cone_generators(normals, mu, 8)
-    E = np.concatenate(
-        [
-            kin.point_jacobian(w.surfaces[n].body, p).T @ g.T
-            for n, p, g in zip(names, points, cones, strict=True)
-        ],
-        axis=1,
-    )
+    points = contact_points(kin, contacts)
+    cones = cone_generators(points.normals, points.mu, 8)
+    J = point_jacobians(kin, points).reshape(len(cones), 3, -1)
+    E = np.concatenate([j.T @ g.T for j, g in zip(J, cones, strict=True)], axis=1)
     load, tau = E[w.dadr], force[w.dadr]
     limit = effort * w.tau_max
     found = linprog(

@@ -24,8 +24,9 @@ from clamber.planning.trajectory import (
     point_prices,
     zero_moment_point,
 )
-from clamber.step.posture import bearing_frames
+from clamber.step.stability import contact_points, point_jacobians
 from clamber.step.statics import (
+    Load,
     com_margin,
     cone_generators,
     contact_forces,
@@ -239,12 +240,10 @@ def unbalanced(kin, q, contacts, tau) -> tuple[float, float]:
     """Least |J' f + S' tau - g| over forces in the friction cones, base and joints."""
     world = kin.world
     kin.update(q)
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    cones = cone_generators(normals, mu, 16)
-    columns = [
-        kin.point_jacobian(world.surfaces[n].body, p).T @ g.T
-        for n, p, g in zip(names, points, cones, strict=True)
-    ]
+    points = contact_points(kin, contacts)
+    cones = cone_generators(points.normals, points.mu, 16)
+    J = point_jacobians(kin, points).reshape(len(cones), 3, -1)
+    columns = [j.T @ g.T for j, g in zip(J, cones, strict=True)]
     wanted = kin.gravity()
     wanted[world.dadr] -= tau
     A = np.concatenate(columns, axis=1)
@@ -291,13 +290,12 @@ def test_a_contact_that_leaves_bears_less_and_less(demo_kinematics, knee_phases)
             continue
         kin = demo_kinematics
         kin.update(shift.q[0])  # the same posture: only the price differs
-        names, points, normals, mu = bearing_frames(kin, contacts)
+        points = contact_points(kin, contacts)
         prices = point_prices(kin, contacts, price)
-        assert len(prices) == len(points)
-        f = contact_forces(
-            points, normals, mu, kin.com.copy(), kin.world.mass, price=prices
-        ).forces
-        mine = [n == "LFoot" for n in names]
+        assert len(prices) == len(points.points)
+        load = Load(com=kin.com.copy(), mass=kin.world.mass)
+        f = contact_forces(points, load, price=prices).forces
+        mine = [n == "LFoot" for n in points.names]
         shares.append(float(f[mine, 2].sum()))
     assert np.all(np.diff(shares[:-1]) <= 1e-6)
     assert shares[0] > shares[-2] + 1.0
@@ -425,7 +423,7 @@ def lowest_dynamic_margin(kin, world, phases, speed: float) -> float:
         com = np.array(com)
         acceleration = (com[2:] - 2 * com[1:-1] + com[:-2]) * (RATE / 10) ** 2
         kin.update(phase.q[-1])
-        points = bearing_frames(kin, phase.contacts)[1]
+        points = contact_points(kin, phase.contacts).points
         polygon = support_polygon(points[:, :2])
         p = zero_moment_point(com[1:-1], acceleration, points[:, 2].min())
         worst = min(worst, min(com_margin(x, polygon) for x in p))

@@ -11,7 +11,7 @@ from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.se3 import matrix_from_rpy
 from clamber.step.ik import IK
-from clamber.step.posture import bearing_frames, contact_drift, equilibrium_at
+from clamber.step.stability import contact_drift, contact_points, equilibrium_at
 from clamber.step.statics import com_margin, support_ellipse, support_polygon
 from clamber.step.transition import (
     MARGINS,
@@ -40,7 +40,7 @@ def ik(demo_plan):
 
 def polygon_of(kin, contacts) -> np.ndarray:
     """Support polygon of contacts at the present posture."""
-    return support_polygon(bearing_frames(kin, contacts)[1][:, :2])
+    return support_polygon(contact_points(kin, contacts).points[:, :2])
 
 
 # The orientation of reach-to-support (4.26, 4.27).
@@ -126,8 +126,7 @@ def test_forces_on_the_contacts_that_stay_hold_the_robot_alone(
     transitions, demo_kinematics, posture
 ):
     for t in transitions:
-        demo_kinematics.update(getattr(t, posture))
-        assert equilibrium_at(demo_kinematics, t.held).feasible
+        assert equilibrium_at(demo_kinematics, getattr(t, posture), t.held).feasible
 
 
 def test_before_the_shift_some_move_could_not_do_without_its_contact(

@@ -24,7 +24,8 @@ from clamber.run.folder import load_plan, save_plan
 from clamber.step import direct
 from clamber.step.change import standing
 from clamber.step.ik import IK
-from clamber.step.posture import KeyframeTask, contact_drift
+from clamber.step.posture import KeyframeTask
+from clamber.step.stability import contact_drift
 from conftest import stairs
 
 

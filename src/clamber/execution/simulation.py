@@ -23,7 +23,7 @@ from clamber.model.scene import GROUND, Scene
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
-from clamber.step.posture import STANDING_SHARE, standing_share
+from clamber.step.stability import STANDING_SHARE, standing_share
 
 STRIDE = 10  # physics steps between two recorded states
 SETTLE = 1.0  # [s] the end must hold this long

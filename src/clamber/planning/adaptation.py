@@ -35,7 +35,8 @@ from clamber.step import direct
 from clamber.step.change import standing
 from clamber.step.ik import IK, NO_WARINESS, ContactGoal, Wary, support_rotation
 from clamber.step.path import ARC_WEIGHT, Path, Phase, bridge
-from clamber.step.posture import Keyframe, KeyframeTask, bearing_frames
+from clamber.step.posture import Keyframe, KeyframeTask
+from clamber.step.stability import contact_points
 from clamber.step.statics import com_margin, support_polygon
 from clamber.step.transition import balance_problem
 
@@ -261,7 +262,7 @@ def feeling(
     ik = IK(world)
     free = _limb_over(world, contact)
     ik.kin.update(q)
-    points = bearing_frames(ik.kin, held)[1][:, :2]
+    points = contact_points(ik.kin, held).points[:, :2]
     room = com_margin(ik.kin.com[:2], support_polygon(points))
     if room <= 0:
         return None

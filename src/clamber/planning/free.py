@@ -38,7 +38,8 @@ from clamber.planning.records import PlanOptions, Progress
 from clamber.step.change import plan_step, standing
 from clamber.step.ik import IK
 from clamber.step.path import Path
-from clamber.step.posture import STANDING_SHARE, Keyframe, standing_share
+from clamber.step.posture import Keyframe
+from clamber.step.stability import STANDING_SHARE, standing_share
 
 Counts = Mapping[tuple[Region, str], float]
 

@@ -29,7 +29,8 @@ from clamber.planning.trajectory import Trajectory, build_trajectory
 from clamber.step.change import standing
 from clamber.step.ik import IK
 from clamber.step.path import Path, Phase, overlap, watched_pairs
-from clamber.step.posture import Keyframe, weakness
+from clamber.step.posture import Keyframe
+from clamber.step.stability import limiting_joint
 
 # Where a step is missed, the search begins again with other weights of the keyframes:
 # they lead it to other contacts, from which there may be a way. The default is first.
@@ -188,8 +189,7 @@ def check_start(ik: IK, start: Keyframe) -> None:
     if start.com_margin < 0 or not start.equilibrium.feasible:
         why = f"its mass is {-1e3 * start.com_margin:.0f} mm beside its soles"
         if start.com_margin >= 0:
-            ik.kin.update(start.q)
-            why = weakness(ik.kin, start.stance)
+            why = limiting_joint(ik.kin, start.q, start.stance)
         raise InputError(
             f"a posture that stands within the effort limits ({why})",
             field="robot.home",

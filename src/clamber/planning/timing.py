@@ -21,7 +21,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
-from clamber.step.posture import EFFORT_SHARE, bearing_frames
+from clamber.step.stability import EFFORT_SHARE, contact_points, point_jacobians
 from clamber.step.statics import cone_generators, support_polygon
 
 JOINT_SPEED = 4.0  # [rad/s] of a joint whose description has no lower limit
@@ -90,19 +90,13 @@ def demand_at(
         mujoco.mj_rne(m, d, 0, out)
         bias.append(out)
     d.qvel[:] = 0.0
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    J = np.concatenate(
-        [
-            kin.point_jacobian(kin.world.surfaces[n].body, p).copy()
-            for n, p in zip(names, points, strict=True)
-        ]
-    )
+    points = contact_points(kin, contacts)
     return Demand(
         rest=bias[0],
         inertia=inertia,
         velocity=bent + bias[1] - bias[0],
-        jacobian=J,
-        cones=cone_generators(normals, mu, 4),
+        jacobian=point_jacobians(kin, points),
+        cones=cone_generators(points.normals, points.mu, 4),
     )
 
 

@@ -27,8 +27,14 @@ from clamber.model.se3 import quat_conjugate, quat_multiply
 from clamber.model.world import World
 from clamber.planning.timing import GRID, demand_at, least_torques, retime
 from clamber.step.path import Phase
-from clamber.step.posture import bearing_frames, torque_limits
-from clamber.step.statics import GRAVITY, com_margins, contact_forces, support_polygon
+from clamber.step.stability import contact_points, torque_limits
+from clamber.step.statics import (
+    GRAVITY,
+    Load,
+    com_margins,
+    contact_forces,
+    support_polygon,
+)
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
@@ -229,15 +235,12 @@ def holding_torque(
     """
     w = kin.world
     kin.update(q)
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    com = kin.com.copy()
-    limits = torque_limits(kin, names, points)
+    points, load = contact_points(kin, contacts), Load(com=kin.com.copy(), mass=w.mass)
+    limits = torque_limits(kin, points)
     prices = None if price is None else point_prices(kin, contacts, price)
     tau = np.zeros(len(w.dadr))
     for torque in (None, limits):
-        found = contact_forces(
-            points, normals, mu, com, w.mass, torque=torque, price=prices
-        )
+        found = contact_forces(points, load, torque=torque, price=prices)
         tau = limits.torques(found.forces)
         if np.all(np.abs(tau) <= limits.limits):
             break
@@ -345,7 +348,7 @@ def _balanced_cruise(
         kin.update(q)
         com[i] = kin.com
     path = CubicSpline(fine, com)
-    points = bearing_frames(kin, phase.contacts)[1]
+    points = contact_points(kin, phase.contacts).points
     polygon = support_polygon(points[:, :2])
     low = float(points[:, 2].min())
     room = np.maximum(com_margins(com[:, :2], polygon), 0.0)

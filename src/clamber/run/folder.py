@@ -56,7 +56,8 @@ from clamber.planning.records import Iteration, Midway, Plan, PlanOptions
 from clamber.planning.substitutes import Replanned
 from clamber.planning.trajectory import Samples, Trajectory
 from clamber.step.ik import Residuals
-from clamber.step.posture import ContactState, Keyframe, bearing_frames
+from clamber.step.posture import Keyframe
+from clamber.step.stability import ContactState, contact_points
 from clamber.step.statics import Phase, StaticEquilibrium
 
 VERSION = 1
@@ -894,7 +895,7 @@ def _robot_fields(robot: Robot) -> dict[str, Any]:
 def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
     """A keyframe by the keys of `plan.json`."""
     kin.update(k.q)
-    names, points, _, _ = bearing_frames(kin, k.stance)
+    points = contact_points(kin, k.stance)
     e = k.equilibrium
     return {
         "qpos": k.q,
@@ -913,8 +914,8 @@ def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
             "feasible": e.feasible,
             "margin": e.margin,
             "limiting": e.limiting,
-            "surfaces": names,
-            "points": points,
+            "surfaces": points.names,
+            "points": points.points,
             "forces": e.forces,
             "torques": e.torques,
         },

@@ -21,8 +21,8 @@ from clamber.step.posture import (
     KeyframeOptions,
     KeyframeTask,
     finish,
-    weakness,
 )
+from clamber.step.stability import limiting_joint
 from clamber.step.transition import (
     MARGINS,
     approach_contact,
@@ -173,8 +173,7 @@ def _best_margin(
 ) -> Path | str:
     """The path with the largest of `MARGINS` for which there is one, or why not."""
     if key.status is Status.OVERLOADED:
-        ik.kin.update(key.q)
-        return f"{step}: {weakness(ik.kin, key.stance)}"
+        return f"{step}: {limiting_joint(ik.kin, key.q, key.stance)}"
     if key.status is not Status.SOLVED:
         return f"{step}: {key.status.value}"
     reason = ""

@@ -35,8 +35,8 @@ from clamber.model.se3 import frame_from_normal, matrix_from_quat, rotation_vect
 from clamber.model.world import Surface, World
 from clamber.step.statics import (
     com_margin,
-    ellipse_excess,
     polygon_halfplanes,
+    support_ellipse,
     support_polygon,
 )
 
@@ -963,7 +963,7 @@ class IK:
             )
         excess, gradient = 0.0, com
         if problem.ellipse_weight > 0:
-            excess, gradient = ellipse_excess(polygon, com)
+            excess, gradient = support_ellipse(polygon).excess(com)
         if excess > 0:
             drawn = self._target(np.array([excess]), problem.ellipse_weight)
 

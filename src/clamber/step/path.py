@@ -21,7 +21,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Support
 from clamber.model.world import World
 from clamber.step.ik import IK, ContactGoal, PostureProblem, support_rotation
-from clamber.step.posture import contact_drift, holds, weakness
+from clamber.step.stability import contact_drift, is_stable, limiting_joint
 from clamber.step.transition import CLEARANCE, Transition, balance_problem
 
 SAFE_HEIGHT = 0.05  # [m] h_safe of (4.29)
@@ -321,7 +321,7 @@ def _fill(
             middle, share = interpolate(ik.kin, q0, q1, 0.5), 0.5 * (s0 + s1)
             inner = ENDS * min(share, 1.0 - share) >= 1.0
             depth, _ = overlap(ik, middle, aloft if inner else low)
-            if _drift(ik, contacts) > DRIFT_TOL or depth > OVERLAP_TOL:
+            if _drift(ik, middle, contacts) > DRIFT_TOL or depth > OVERLAP_TOL:
                 out.append((share, node(share, middle, True)))
             out.append((s1, q1))
         if len(out) == len(nodes):
@@ -353,8 +353,9 @@ def overlap(ik: IK, q: np.ndarray, watched: np.ndarray) -> tuple[float, int]:
     return -float(near.distance[i]), int(near.pairs[i])
 
 
-def _drift(ik: IK, contacts: tuple[Contact, ...]) -> float:
-    """Largest distance of a contact from its place at the present posture [m]."""
+def _drift(ik: IK, q: np.ndarray, contacts: tuple[Contact, ...]) -> float:
+    """Largest distance of a contact from its place at `q` (nq,) [m]."""
+    ik.kin.update(q)
     return max((contact_drift(ik.kin, c) for c in contacts), default=0.0)
 
 
@@ -379,12 +380,13 @@ def check_phases(
                     names = [world.model.geom(int(g)).name for g in world.pairs[pair]]
                     where = f"{1e3 * depth:.1f} mm ({phase.kind})"
                     note = f"{' and '.join(names)} overlap by {where}"
-                drift = _drift(ik, phase.contacts)
+                drift = _drift(ik, q, phase.contacts)
                 if drift > DRIFT_LIMIT:
                     where = f"{1e3 * drift:.0f} mm ({phase.kind})"
                     return Status.UNREACHABLE, f"a contact opens by {where}"
-            if phase.kind == "swing" and not weak and not holds(kin, phase.load_after):
-                weak = weakness(kin, phase.load_after)
+            if phase.kind == "swing" and not weak:
+                if not is_stable(kin, b, phase.load_after):
+                    weak = limiting_joint(kin, b, phase.load_after)
     if worst > OVERLAP_LIMIT:
         return Status.COLLIDING, note
     return (Status.OVERLOADED, weak) if weak else (Status.SOLVED, note)

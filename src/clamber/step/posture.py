@@ -11,8 +11,7 @@ posture that closes every contact, balanced and free of collisions.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -32,27 +31,11 @@ from clamber.step.ik import (
     contact_clearance,
     support_rotation,
 )
-from clamber.step.statics import (
-    BALANCE_TOL,
-    GRAVITY,
-    Phase,
-    StaticEquilibrium,
-    TorqueLimits,
-    contact_angle,
-    contact_forces,
-    contact_phase,
-    projected_distance,
-    static_equilibrium,
-    strength_needed,
-    theta_max,
-)
+from clamber.step.stability import ContactState, contact_state, equilibrium_at
+from clamber.step.statics import StaticEquilibrium
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
-EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
-SPARED_ARM = 0.004  # [m] times the weight: torque that is not counted on for holding
-LEAST_SHARE = 0.25  # of the effort limits that is, all the same
 CLEARANCE = 0.010  # [m] p_safe: between links, and between links and the scene
-STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
 HOLD_WEIGHT = 40.0  # of a new contact at a position that an outer method prescribes
 
 
@@ -104,23 +87,6 @@ class KeyframeOptions:
     gradient_stop: float = 1e-3
     max_iterations: int = 200
     learning_rate: float = 0.1
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class ContactState:
-    """A contact with its geometric stability (4.17).
-
-    Attributes:
-        contact: Where it is.
-        projected_distance: d, horizontal, to the mass it supports [m].
-        contact_angle: theta, from the vertical to the line to that mass [rad].
-        phase: supporting, reach-to-supportable or sliding.
-    """
-
-    contact: Contact
-    projected_distance: float
-    contact_angle: float
-    phase: Phase
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -222,129 +188,6 @@ def new_positions(kin: Kinematics, task: KeyframeTask) -> np.ndarray:
     ).reshape(-1, 3)
 
 
-def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> ContactState:
-    """Geometric stability of a contact at the present posture."""
-    mass = kin.landmark(kin.world.robot.limb_of(c.surface).root)[1]
-    d = projected_distance(c.position, mass)
-    theta = contact_angle(c.position, mass)
-    length = float(np.linalg.norm(mass - c.position))
-    support = kin.world.supports[c.support]
-    limit = theta_max(support.friction)
-    phase = contact_phase(d, length, limit, loaded=loaded)
-    # On a slope the line to the mass must lie within the cone about the normal too.
-    slope = contact_angle(c.position, mass, support.normal)
-    if support.normal[2] < 1.0 and slope > math.atan(support.friction):
-        phase = "sliding"
-    return ContactState(
-        contact=c,
-        projected_distance=d,
-        contact_angle=theta,
-        phase=phase,
-    )
-
-
-def bearing_frames(
-    kin: Kinematics, contacts: Sequence[Contact]
-) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
-    """Names, points (n, 3), normals (n, 3), friction (n,) of all bearing points."""
-    names, points, normals, mu = [], [], [], []
-    for c in contacts:
-        support = kin.world.supports[c.support]
-        p = kin.bearing_points(c.surface, support.normal, c.edge)
-        names += [c.surface] * len(p)
-        points.append(p)
-        normals.append(np.tile(support.normal, (len(p), 1)))
-        mu += [support.friction] * len(p)
-    return names, np.concatenate(points), np.concatenate(normals), np.array(mu)
-
-
-def equilibrium_at(kin: Kinematics, contacts: tuple[Contact, ...]) -> StaticEquilibrium:
-    """Static equilibrium with cones and `holding_limits` at the present posture."""
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    return static_equilibrium(
-        points,
-        normals,
-        mu,
-        kin.com.copy(),
-        kin.world.mass,
-        names=names,
-        torque=torque_limits(kin, names, points),
-    )
-
-
-def holds(kin: Kinematics, contacts: tuple[Contact, ...]) -> bool:
-    """Whether forces within cones and torque limits hold the present posture.
-
-    What `equilibrium_at` says without a margin, at a hundredth of the cost.
-    """
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    torque = torque_limits(kin, names, points)
-    com, mass = kin.com.copy(), kin.world.mass
-    found = contact_forces(points, normals, mu, com, mass, torque=torque)
-    return found.residual <= BALANCE_TOL
-
-
-def weakness(kin: Kinematics, contacts: tuple[Contact, ...]) -> str:
-    """Which joint is too weak where contacts do not hold the present posture."""
-    names, points, normals, mu = bearing_frames(kin, contacts)
-    torque = torque_limits(kin, names, points)
-    needed = strength_needed(
-        points, normals, mu, kin.com.copy(), kin.world.mass, torque=torque
-    )
-    if needed is None:
-        return f"{Status.OVERLOADED.value}, however strong its joints"
-    share, j = needed
-    counted = float(torque.limits[j])
-    return (
-        f"{Status.OVERLOADED.value}: {torque.names[j]} would have to bear"
-        f" {share * counted:.1f} N m; {counted:.1f} of its"
-        f" {float(kin.world.tau_max[j]):g} are counted on"
-    )
-
-
-def holding_limits(world: World, bearing: np.ndarray) -> np.ndarray:
-    """(na,) torques that are counted on to hold a posture [N m].
-
-    `EFFORT_SHARE` of the effort limits; of joints that a contact loads, less what one
-    costs that lies beside where it was planned: `SPARED_ARM` times the weight is 16 mm
-    for one that bears a quarter. To a strong joint that is nothing, to a weak wrist
-    much.
-
-    Args:
-        world: Robot and scene.
-        bearing: (na,) bool, joints that a contact loads.
-    """
-    spared = SPARED_ARM * world.mass * GRAVITY * bearing
-    least = LEAST_SHARE * world.tau_max
-    return np.maximum(EFFORT_SHARE * world.tau_max - spared, least)
-
-
-def torque_limits(
-    kin: Kinematics, names: Sequence[str], points: np.ndarray
-) -> TorqueLimits:
-    """What the joints bear, `holding_limits`, with forces at bearing points.
-
-    Args:
-        kin: At the posture.
-        names: Surface of each point.
-        points: (n, 3) in the world.
-    """
-    w = kin.world
-    J = np.concatenate(
-        [
-            kin.point_jacobian(w.surfaces[n].body, p).copy()
-            for n, p in zip(names, points, strict=True)
-        ]
-    )
-    return TorqueLimits(
-        jacobian=J,
-        gravity=kin.gravity(),
-        dofs=w.dadr,
-        limits=holding_limits(w, np.abs(J[:, w.dadr]).max(axis=0) > 0.0),
-        names=w.joints,
-    )
-
-
 def finish(
     ik: IK,
     task: KeyframeTask,
@@ -384,7 +227,7 @@ def finish(
         kin, task, new_positions(kin, task), options.stability_weight
     )
     com = kin.com.copy()
-    equilibrium = equilibrium_at(kin, measured.held)
+    equilibrium = equilibrium_at(kin, q, measured.held)
     status = residuals.status
     fresh = {c.surface for c in task.new}
     if status is Status.SOLVED and not equilibrium.feasible:
@@ -405,23 +248,6 @@ def finish(
         cost_before=cost_before,
         cost_after=cost_after,
     )
-
-
-def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> float:
-    """Height of the pelvis over its supports, against that over the ground at first.
-
-    Over the nearest of them, along its normal. A robot on its feet alone stands from
-    `STANDING_SHARE` on; below, it squats.
-    """
-    over = [float(world.supports[c.support].height(q[:3])) for c in stance]
-    return min(over) / float(world.home[2])
-
-
-def contact_drift(kin: Kinematics, c: Contact) -> float:
-    """Distance of a contact from where it should be at the present posture [m]."""
-    n = kin.world.supports[c.support].normal
-    p = kin.contact_point(c.surface, n, c.edge)
-    return float(np.linalg.norm(p - c.position - kin.roll(c.surface, n, c.link)))
 
 
 def _orientation(kin: Kinematics, c: Contact) -> np.ndarray:

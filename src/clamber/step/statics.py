@@ -238,15 +238,6 @@ class SupportEllipse:
     foci: np.ndarray
     string_length: float
 
-    def __post_init__(self) -> None:
-        """Copy the arrays and check their shapes."""
-        for name, shape in (("centre", (2,)), ("semi_axes", (2,)), ("foci", (2, 2))):
-            x = np.array(getattr(self, name), dtype=float)
-            if x.shape != shape:
-                raise ValueError(f"{name} has shape {x.shape}, expected {shape}")
-            x.setflags(write=False)
-            object.__setattr__(self, name, x)
-
     def excess(self, com: ArrayLike) -> tuple[float, np.ndarray]:
         """Summed distance of a point to the foci less the string length (4.28).
 
@@ -257,7 +248,13 @@ class SupportEllipse:
             excess: d_com - s, negative inside, zero on the border [m].
             gradient: (2,) its derivative by x and y; a focus itself adds nothing.
         """
-        return _excess(self.foci.tolist(), self.string_length, com)
+        x, y = np.asarray(com, dtype=float)[:2].tolist()
+        total, gx, gy = -self.string_length, 0.0, 0.0
+        for fx, fy in self.foci.tolist():
+            d = math.hypot(x - fx, y - fy)
+            total += d
+            gx, gy = gx + (x - fx) / max(d, 1e-12), gy + (y - fy) / max(d, 1e-12)
+        return total, np.array([gx, gy])
 
 
 def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
@@ -271,38 +268,6 @@ def support_ellipse(polygon: np.ndarray) -> SupportEllipse:
     the largest ellipse that fits at all. Collinear points give the segment, one point
     itself, as ellipses without area: no centre of mass has a negative excess there.
     """
-    (x, y), major, minor, (fx, fy) = _fit_ellipse(polygon)
-    return SupportEllipse(
-        centre=np.array([x, y]),
-        semi_axes=np.array([major, minor]),
-        foci=np.array([[x - fx, y - fy], [x + fx, y + fy]]),
-        string_length=2 * major,
-    )
-
-
-def ellipse_excess(polygon: np.ndarray, com: ArrayLike) -> tuple[float, np.ndarray]:
-    """`support_ellipse(polygon).excess(com)`, without the record."""
-    (x, y), major, _, (fx, fy) = _fit_ellipse(polygon)
-    return _excess([[x - fx, y - fy], [x + fx, y + fy]], 2 * major, com)
-
-
-def _excess(
-    foci: list[list[float]], string_length: float, com: ArrayLike
-) -> tuple[float, np.ndarray]:
-    x, y = np.asarray(com, dtype=float)[:2].tolist()
-    total, gx, gy = -string_length, 0.0, 0.0
-    for fx, fy in foci:
-        d = math.hypot(x - fx, y - fy)
-        total += d
-        gx, gy = gx + (x - fx) / max(d, 1e-12), gy + (y - fy) / max(d, 1e-12)
-    return total, np.array([gx, gy])
-
-
-_Pair = tuple[float, float]
-
-
-def _fit_ellipse(polygon: np.ndarray) -> tuple[_Pair, float, float, _Pair]:
-    """Centre, semi-axes and a focus, from the centre, of `support_ellipse`."""
     v = np.asarray(polygon, dtype=float).tolist()
     if not v:
         raise ValueError("a polygon without vertices has no ellipse")
@@ -324,7 +289,7 @@ def _fit_ellipse(polygon: np.ndarray) -> tuple[_Pair, float, float, _Pair]:
     area *= 0.5
     if area <= 1e-12 * square:
         half = max(r, key=lambda p: p[0] * p[0] + p[1] * p[1])
-        return (mx, my), math.hypot(*half), 0.0, half
+        return _ellipse((mx, my), math.hypot(*half), 0.0, half)
     cx, cy = cx / (6 * area), cy / (6 * area)
     xx, xy, yy = (m / (24 * area) for m in (xx, xy, yy))
     xx, xy, yy = xx - cx * cx, xy - cx * cy, yy - cy * cy
@@ -339,10 +304,67 @@ def _fit_ellipse(polygon: np.ndarray) -> tuple[_Pair, float, float, _Pair]:
     major, minor = math.sqrt(k * (half + skew)), math.sqrt(k * max(half - skew, 0.0))
     focal = math.sqrt(max(major * major - minor * minor, 0.0))
     focus = (focal * math.cos(angle), focal * math.sin(angle))
-    return (mx + cx, my + cy), major, minor, focus
+    return _ellipse((mx + cx, my + cy), major, minor, focus)
+
+
+def _ellipse(
+    centre: tuple[float, float], major: float, minor: float, focus: tuple[float, float]
+) -> SupportEllipse:
+    """Of semi-axes `major` and `minor`, with a focus seen from the centre."""
+    (x, y), (fx, fy) = centre, focus
+    return SupportEllipse(
+        centre=np.array([x, y]),
+        semi_axes=np.array([major, minor]),
+        foci=np.array([[x - fx, y - fy], [x + fx, y + fy]]),
+        string_length=2 * major,
+    )
 
 
 # Forces.
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ContactPoints:
+    """Where the supports can push.
+
+    Attributes:
+        points: (nc, 3) [m].
+        normals: (nc, 3) unit normals out of the supports.
+        mu: (nc,) friction coefficients, positive.
+        names: (nc,) the contact that each point belongs to.
+        cone_edges: m of the pyramids inside their friction cones.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    mu: np.ndarray
+    names: Sequence[str]
+    cone_edges: int = CONE_EDGES
+
+    def __post_init__(self) -> None:
+        """Check that the shapes agree."""
+        n = len(self.points)
+        if not n == len(self.normals) == len(self.mu) == len(self.names):
+            raise ValueError(f"{n} points, but other numbers of normals, mu or names")
+
+    def wrenches(self, com: np.ndarray) -> np.ndarray:
+        """(nc * m, 6) of unit normal forces along the cones' edges, about `com`."""
+        E = cone_generators(self.normals, self.mu, self.cone_edges)
+        r = np.repeat(self.points - com, self.cone_edges, axis=0)
+        return _wrenches(r, E.reshape(-1, 3))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Load:
+    """What the contacts bear.
+
+    Attributes:
+        com: (3,) centre of mass [m].
+        mass: [kg].
+    """
+
+    com: np.ndarray
+    mass: float
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -483,14 +505,7 @@ _WEIGHT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 _EYE = np.eye(6)
 
 
-def is_statically_stable(
-    points: np.ndarray,
-    normals: np.ndarray,
-    mu: np.ndarray,
-    com: np.ndarray,
-    *,
-    cone_edges: int = CONE_EDGES,
-) -> bool:
+def is_statically_stable(contacts: ContactPoints, com: np.ndarray) -> bool:
     """Whether forces within the friction cones can balance gravity: the quick test.
 
     The wrench of the weight, w, lies in the cone of the contact wrenches W iff its
@@ -499,29 +514,20 @@ def is_statically_stable(
     contact forces balance.
 
     Args:
-        points: (nc, 3) [m].
-        normals: (nc, 3) unit normals out of the supports.
-        mu: (nc,) friction coefficients, positive.
+        contacts: Where the supports push.
         com: (3,) centre of mass [m].
-        cone_edges: m of the pyramids inside the cones.
     """
-    n = len(points) * cone_edges
-    if n == 0:
+    W = contacts.wrenches(com)
+    if len(W) == 0:
         return False
-    r = np.repeat(points - com, cone_edges, axis=0)
-    W = _wrenches(r, cone_generators(normals, mu, cone_edges).reshape(n, 3))
-    y, _, flag, _ = daqp.solve(_EYE, -_WEIGHT, W, np.zeros(n), primal_tol=1e-8)
+    y, _, flag, _ = daqp.solve(_EYE, -_WEIGHT, W, np.zeros(len(W)), primal_tol=1e-8)
     return flag == 1 and float(y @ y) <= BALANCE_TOL**2
 
 
 def contact_forces(
-    points: np.ndarray,
-    normals: np.ndarray,
-    mu: np.ndarray,
-    com: np.ndarray,
-    mass: float,
+    contacts: ContactPoints,
+    load: Load,
     *,
-    cone_edges: int = CONE_EDGES,
     torque: TorqueLimits | None = None,
     price: np.ndarray | None = None,
 ) -> ContactForces:
@@ -534,20 +540,17 @@ def contact_forces(
     the stance cannot hold they are the best effort.
 
     Args:
-        points: (nc, 3) [m].
-        normals: (nc, 3) unit normals out of the supports.
-        mu: (nc,) friction coefficients, positive.
-        com: (3,) centre of mass [m].
-        mass: [kg].
-        cone_edges: m of the pyramids.
+        contacts: Where the supports push.
+        load: What they bear.
         torque: Joint torques to keep within their limits.
         price: (nc,) p, of a force at each point, positive; None: 1 each.
     """
-    nc, na = len(points), 0 if torque is None else len(torque.dofs)
+    nc, na = len(contacts.points), 0 if torque is None else len(torque.dofs)
+    cone_edges = contacts.cone_edges
     if nc == 0:
         return ContactForces(forces=np.zeros((0, 3)), residual=1.0)
-    weight = mass * GRAVITY
-    R = contact_frames(normals)
+    weight = load.mass * GRAVITY
+    R = contact_frames(contacts.normals)
     nf, ns = 3 * nc, 6 + na
     # x = (forces in contact frames [weights], residuals of balance and torques)
     H = np.zeros((nf + ns, nf + ns))
@@ -560,7 +563,7 @@ def contact_forces(
     A = np.zeros((ns + nc * cone_edges, nf + ns))
     upper, lower = np.zeros(len(A)), np.full(len(A), -1e30)
     sense = np.zeros(len(A), dtype=np.intc)
-    r = np.repeat(points - com, 3, axis=0)
+    r = np.repeat(contacts.points - load.com, 3, axis=0)
     A[:6, :nf] = _wrenches(r, R.transpose(0, 2, 1).reshape(nf, 3)).T
     A[:ns, nf:].flat[:: ns + 1] = 1.0
     upper[:6] = lower[:6] = _WEIGHT
@@ -571,7 +574,7 @@ def contact_forces(
         g = torque.gravity[torque.dofs]
         upper[6:ns] = (g + torque.limits) / weight
         lower[6:ns] = (g - torque.limits) / weight
-    facets = _pyramid(1.0 / np.asarray(mu), cone_edges, 0.5)
+    facets = _pyramid(1.0 / contacts.mu, cone_edges, 0.5)
     facets[:, :, 2] = -math.cos(math.pi / cone_edges)
     for i in range(nc):
         rows = slice(ns + i * cone_edges, ns + (i + 1) * cone_edges)
@@ -585,15 +588,7 @@ def contact_forces(
 
 
 def static_equilibrium(
-    points: np.ndarray,
-    normals: np.ndarray,
-    mu: np.ndarray,
-    com: np.ndarray,
-    mass: float,
-    *,
-    names: Sequence[str],
-    cone_edges: int = CONE_EDGES,
-    torque: TorqueLimits | None = None,
+    contacts: ContactPoints, load: Load, *, torque: TorqueLimits | None = None
 ) -> StaticEquilibrium:
     """Judge a posture by forces: the check that does not depend on how it was found.
 
@@ -605,32 +600,25 @@ def static_equilibrium(
     without margin and torques.
 
     Args:
-        points: (nc, 3) [m].
-        normals: (nc, 3) unit normals out of the supports.
-        mu: (nc,) friction coefficients, positive.
-        com: (3,) centre of mass [m].
-        mass: [kg].
-        names: (nc,) the contact each point belongs to.
-        cone_edges: m of the pyramids inside the cones.
+        contacts: Where the supports push.
+        load: What they bear.
         torque: Joint torques to keep within their limits. Their gravity and Jacobians
             must be those of the posture whose points and centre of mass are given.
     """
-    held = contact_forces(
-        points, normals, mu, com, mass, cone_edges=cone_edges, torque=torque
-    )
+    held = contact_forces(contacts, load, torque=torque)
     margin, limiting = -PUSH_LIMIT, None
-    if len(points):
-        lp = _build_push_lp(points, normals, mu, com, mass, cone_edges, torque)
+    if len(contacts.points):
+        lp = _build_push_lp(contacts, load, torque)
         margin, duals = _push_margin(lp)
-        owners = [n for n in names for _ in range(cone_edges)]
+        owners = [n for n in contacts.names for _ in range(contacts.cone_edges)]
         owners += () if torque is None else [*torque.names, *torque.names]
         yields: dict[str, float] = {}
         for name, dual in zip(owners, duals.tolist(), strict=True):
             yields[name] = max(yields.get(name, 0.0), dual)
         limiting = max(yields, key=lambda name: yields[name])
         if yields[limiting] <= 10 * LP_WEIGHT:  # it turns about contacts that stay
-            pivot = names[int(np.argmax(np.linalg.norm(held.forces, axis=1)))]
-            limiting = pivot if margin < PUSH_LIMIT - PUSH_TOL else None
+            most = int(np.argmax(np.linalg.norm(held.forces, axis=1)))
+            limiting = contacts.names[most] if margin < PUSH_LIMIT - PUSH_TOL else None
     return StaticEquilibrium(
         feasible=margin >= -PUSH_TOL,
         margin=margin,
@@ -641,14 +629,7 @@ def static_equilibrium(
 
 
 def strength_needed(
-    points: np.ndarray,
-    normals: np.ndarray,
-    mu: np.ndarray,
-    com: np.ndarray,
-    mass: float,
-    *,
-    torque: TorqueLimits,
-    cone_edges: int = CONE_EDGES,
+    contacts: ContactPoints, load: Load, torque: TorqueLimits
 ) -> tuple[float, int] | None:
     """How many times as strong all joints would have to be, and which one limits that.
 
@@ -656,21 +637,17 @@ def strength_needed(
     torques |tau| <= s limits: an LP. At most 1 where the posture holds.
 
     Args:
-        points: (nc, 3) [m].
-        normals: (nc, 3) unit normals out of the supports.
-        mu: (nc,) friction coefficients, positive.
-        com: (3,) centre of mass [m].
-        mass: [kg].
+        contacts: Where the supports push.
+        load: What they bear.
         torque: What the joints bear.
-        cone_edges: m of the pyramids inside the cones.
 
     Returns:
         s, and the index into `torque.names`; None where no strength would do.
     """
-    if len(points) == 0:
+    if len(contacts.points) == 0:
         return None
-    lp = _build_push_lp(points, normals, mu, com, mass, cone_edges, torque)
-    limits = np.concatenate([torque.limits, torque.limits]) / (mass * GRAVITY)
+    lp = _build_push_lp(contacts, load, torque)
+    limits = np.concatenate([torque.limits, torque.limits]) / (load.mass * GRAVITY)
     n = lp.A_eq.shape[1] - 2
     found = linprog(
         np.append(np.zeros(n), 1.0),
@@ -696,30 +673,23 @@ class _PushLP:
 
 
 def _build_push_lp(
-    points: np.ndarray,
-    normals: np.ndarray,
-    mu: np.ndarray,
-    com: np.ndarray,
-    mass: float,
-    cone_edges: int,
-    torque: TorqueLimits | None,
+    contacts: ContactPoints, load: Load, torque: TorqueLimits | None
 ) -> _PushLP:
-    weight = mass * GRAVITY
-    n = len(points) * cone_edges
-    E = cone_generators(normals, mu, cone_edges)
+    weight, W = load.mass * GRAVITY, contacts.wrenches(load.com)
+    n = len(W)
     A_eq = np.zeros((6, n + 2))
-    r = np.repeat(points - com, cone_edges, axis=0)
-    A_eq[:, :n] = _wrenches(r, E.reshape(n, 3)).T
+    A_eq[:, :n] = W.T
     A_eq[0, n] = A_eq[1, n + 1] = 1.0
     A_ub, b_ub = np.zeros((0, n + 2)), np.zeros(0)
     if torque is not None:
         na = len(torque.dofs)
-        J = torque.jacobian[:, torque.dofs].T.reshape(na, len(points), 1, 3)
-        load = np.zeros((na, n + 2))
-        load[:, :n] = np.sum(J * E, axis=3).reshape(na, n)
+        J = torque.jacobian[:, torque.dofs].T.reshape(na, -1, 1, 3)
+        E = W[:, :3].reshape(-1, contacts.cone_edges, 3)
+        turns = np.zeros((na, n + 2))
+        turns[:, :n] = np.sum(J * E, axis=3).reshape(na, n)
         g = torque.gravity[torque.dofs]
         limits = np.concatenate([torque.limits, torque.limits]) / weight
-        A_ub = np.concatenate([load, -load])
+        A_ub = np.concatenate([turns, -turns])
         b_ub = np.concatenate([g, -g]) / weight + limits
     return _PushLP(A_eq=A_eq, b_eq=_WEIGHT, A_ub=A_ub, b_ub=b_ub)
 

@@ -27,7 +27,8 @@ from clamber.step.ik import (
     contact_clearance,
     support_rotation,
 )
-from clamber.step.posture import CLEARANCE, Keyframe, held_goal, holds, weakness
+from clamber.step.posture import CLEARANCE, Keyframe, held_goal
+from clamber.step.stability import is_stable, limiting_joint
 
 REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
 MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
@@ -210,9 +211,8 @@ def plan_transition(
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
     status, note = worst.status, ""
     for s in solutions if status is Status.SOLVED else ():
-        ik.kin.update(s.q)
-        if not holds(ik.kin, held):
-            status, note = Status.OVERLOADED, weakness(ik.kin, held)
+        if not is_stable(ik.kin, s.q, held):
+            status, note = Status.OVERLOADED, limiting_joint(ik.kin, s.q, held)
     return Transition(
         step=step,
         before=before.q,

@@ -1,0 +1,194 @@
+"""Whether this robot stands: the measures of `statics` at its postures.
+
+Geometry proposes (where each contact lies under the mass that it supports), forces
+verify (friction cones and the torques that joints are counted on to hold).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from clamber.contact.contact import Contact
+from clamber.errors import Status
+from clamber.model.kinematics import Kinematics
+from clamber.model.world import World
+from clamber.step.statics import (
+    BALANCE_TOL,
+    GRAVITY,
+    ContactPoints,
+    Load,
+    Phase,
+    StaticEquilibrium,
+    TorqueLimits,
+    contact_angle,
+    contact_forces,
+    contact_phase,
+    projected_distance,
+    static_equilibrium,
+    strength_needed,
+    theta_max,
+)
+
+EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
+SPARED_ARM = 0.004  # [m] times the weight: torque that is not counted on for holding
+LEAST_SHARE = 0.25  # of the effort limits that is, all the same
+STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ContactState:
+    """A contact with its geometric stability (4.17).
+
+    Attributes:
+        contact: Where it is.
+        projected_distance: d, horizontal, to the mass it supports [m].
+        contact_angle: theta, from the vertical to the line to that mass [rad].
+        phase: supporting, reach-to-supportable or sliding.
+    """
+
+    contact: Contact
+    projected_distance: float
+    contact_angle: float
+    phase: Phase
+
+
+def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> ContactState:
+    """Geometric stability of a contact at the present posture."""
+    mass = kin.landmark(kin.world.robot.limb_of(c.surface).root)[1]
+    d = projected_distance(c.position, mass)
+    theta = contact_angle(c.position, mass)
+    length = float(np.linalg.norm(mass - c.position))
+    support = kin.world.supports[c.support]
+    limit = theta_max(support.friction)
+    phase = contact_phase(d, length, limit, loaded=loaded)
+    # On a slope the line to the mass must lie within the cone about the normal too.
+    slope = contact_angle(c.position, mass, support.normal)
+    if support.normal[2] < 1.0 and slope > math.atan(support.friction):
+        phase = "sliding"
+    return ContactState(
+        contact=c,
+        projected_distance=d,
+        contact_angle=theta,
+        phase=phase,
+    )
+
+
+def contact_points(kin: Kinematics, contacts: Sequence[Contact]) -> ContactPoints:
+    """The points of contacts that bear force, at the present posture."""
+    names, points, normals, mu = [], [], [], []
+    for c in contacts:
+        support = kin.world.supports[c.support]
+        p = kin.bearing_points(c.surface, support.normal, c.edge)
+        names += [c.surface] * len(p)
+        points.append(p)
+        normals.append(np.tile(support.normal, (len(p), 1)))
+        mu += [support.friction] * len(p)
+    return ContactPoints(
+        points=np.concatenate(points),
+        normals=np.concatenate(normals),
+        mu=np.array(mu),
+        names=names,
+    )
+
+
+def equilibrium_at(
+    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
+) -> StaticEquilibrium:
+    """Static equilibrium with cones and `holding_limits` at `q` (nq,)."""
+    points, load, torque = _statics_at(kin, q, contacts)
+    return static_equilibrium(points, load, torque=torque)
+
+
+def is_stable(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> bool:
+    """Whether forces within cones and torque limits hold the robot at `q` (nq,).
+
+    What `equilibrium_at` says without a margin, at a hundredth of the cost.
+    """
+    points, load, torque = _statics_at(kin, q, contacts)
+    return contact_forces(points, load, torque=torque).residual <= BALANCE_TOL
+
+
+def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> str:
+    """Which joint is too weak where contacts do not hold the robot at `q` (nq,)."""
+    points, load, torque = _statics_at(kin, q, contacts)
+    needed = strength_needed(points, load, torque)
+    if needed is None:
+        return f"{Status.OVERLOADED.value}, however strong its joints"
+    share, j = needed
+    counted = float(torque.limits[j])
+    return (
+        f"{Status.OVERLOADED.value}: {torque.names[j]} would have to bear"
+        f" {share * counted:.1f} N m; {counted:.1f} of its"
+        f" {float(kin.world.tau_max[j]):g} are counted on"
+    )
+
+
+def _statics_at(
+    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
+) -> tuple[ContactPoints, Load, TorqueLimits]:
+    """What statics looks at; leaves the kinematics at `q`."""
+    kin.update(q)
+    points = contact_points(kin, contacts)
+    load = Load(com=kin.com.copy(), mass=kin.world.mass)
+    return points, load, torque_limits(kin, points)
+
+
+def holding_limits(world: World, bearing: np.ndarray) -> np.ndarray:
+    """(na,) torques that are counted on to hold a posture [N m].
+
+    `EFFORT_SHARE` of the effort limits; of joints that a contact loads, less what one
+    costs that lies beside where it was planned: `SPARED_ARM` times the weight is 16 mm
+    for one that bears a quarter. To a strong joint that is nothing, to a weak wrist
+    much.
+
+    Args:
+        world: Robot and scene.
+        bearing: (na,) bool, joints that a contact loads.
+    """
+    spared = SPARED_ARM * world.mass * GRAVITY * bearing
+    least = LEAST_SHARE * world.tau_max
+    return np.maximum(EFFORT_SHARE * world.tau_max - spared, least)
+
+
+def point_jacobians(kin: Kinematics, points: ContactPoints) -> np.ndarray:
+    """(3 nc, nv) of contact points, stacked, at the present posture."""
+    bodies = [kin.world.surfaces[n].body for n in points.names]
+    return np.concatenate(
+        [
+            kin.point_jacobian(body, p).copy()
+            for body, p in zip(bodies, points.points, strict=True)
+        ]
+    )
+
+
+def torque_limits(kin: Kinematics, points: ContactPoints) -> TorqueLimits:
+    """What the joints bear, `holding_limits`, at the present posture."""
+    w, J = kin.world, point_jacobians(kin, points)
+    return TorqueLimits(
+        jacobian=J,
+        gravity=kin.gravity(),
+        dofs=w.dadr,
+        limits=holding_limits(w, np.abs(J[:, w.dadr]).max(axis=0) > 0.0),
+        names=w.joints,
+    )
+
+
+def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> float:
+    """Height of the pelvis over its supports, against that over the ground at first.
+
+    Over the nearest of them, along its normal. A robot on its feet alone stands from
+    `STANDING_SHARE` on; below, it squats.
+    """
+    over = [float(world.supports[c.support].height(q[:3])) for c in stance]
+    return min(over) / float(world.home[2])
+
+
+def contact_drift(kin: Kinematics, c: Contact) -> float:
+    """Distance of a contact from where it should be at the present posture [m]."""
+    n = kin.world.supports[c.support].normal
+    p = kin.contact_point(c.surface, n, c.edge)
+    return float(np.linalg.norm(p - c.position - kin.roll(c.surface, n, c.link)))
