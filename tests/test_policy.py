@@ -21,11 +21,10 @@ from clamber.contact.policy import (
     pelvis_angles,
     pelvis_distribution,
     pelvis_rotation,
-    wrap,
 )
 from clamber.errors import InputError
 from clamber.model.scene import Box, Scene
-from clamber.model.se3 import matrix_from_rpy
+from clamber.model.se3 import matrix_from_rpy, wrap
 from clamber.run.folder import load_policy, policy_summary, save_policy
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -181,16 +180,6 @@ def test_it_is_faster_than_any_cruise_and_the_same_every_time(
     hold = HOLD_START + HOLD_END
     assert fast.time[-1] - hold < 0.8 * (slow.time[-1] - hold)
     assert fast.velocity_error(demo_plan.world) < 2e-3
-
-
-def test_a_joint_keeps_a_speed_limit_of_its_own(demo_plan, knee_phases, fast):
-    dof = 6 + int(np.argmax(np.abs(fast.v[:, 6:]).max(axis=0)))
-    v_max = demo_plan.world.v_max.copy()
-    v_max[dof] = 0.4
-    world = replace(demo_plan.world, v_max=v_max)
-    slower = build_trajectory(world, knee_phases, speed="max")
-    assert np.abs(fast.v[:, dof]).max() > 0.8
-    assert np.abs(slower.v[:, dof]).max() < 0.4 * 1.05
 
 
 def test_a_run_folder_keeps_the_word_max_and_numbers():

@@ -10,8 +10,12 @@ from clamber.model.se3 import (
     matrix_from_rpy,
     quat_conjugate,
     quat_from_matrix,
+    quat_from_yaw,
     quat_multiply,
     rotation_vector,
+    rpy_from_matrix,
+    wrap,
+    yaw_of,
 )
 
 N = 50
@@ -111,6 +115,32 @@ def test_roll_pitch_yaw_turn_about_fixed_axes_in_that_order(rng):
 )
 def test_each_angle_turns_the_way_its_name_says(rpy, before, after):
     np.testing.assert_allclose(matrix_from_rpy(rpy) @ before, after, atol=1e-15)
+
+
+def test_roll_pitch_yaw_come_back_from_their_matrix(rng):
+    for rpy in rng.uniform(-1, 1, (N, 3)) * [np.pi, np.pi / 2, np.pi]:
+        np.testing.assert_allclose(rpy_from_matrix(matrix_from_rpy(rpy)), rpy)
+    for pitch in (np.pi / 2, -np.pi / 2):  # roll and yaw about one axis
+        R = matrix_from_rpy([0.3, pitch, 0.4])
+        again = rpy_from_matrix(R)
+        assert again[2] == 0.0
+        np.testing.assert_allclose(matrix_from_rpy(again), R, atol=1e-12)
+
+
+def test_the_yaw_is_that_of_roll_pitch_yaw(quats, rng):
+    for q in quats:
+        yaw = rpy_from_matrix(matrix_from_quat(q))[2]
+        assert yaw_of(q) == pytest.approx(yaw)
+    for yaw in rng.uniform(-np.pi, np.pi, N):
+        assert yaw_of(quat_from_yaw(yaw)) == pytest.approx(yaw)
+
+
+def test_wrapped_angles_are_the_same_turns_within_half_a_turn(rng):
+    angles = np.concatenate([rng.uniform(-50, 50, N), [np.pi, -np.pi, 0.0]])
+    wrapped = wrap(angles)
+    assert np.all((wrapped >= -np.pi) & (wrapped < np.pi))
+    turns = (angles - wrapped) / (2 * np.pi)
+    np.testing.assert_allclose(turns, turns.round(), atol=1e-12)
 
 
 def test_the_rotation_vector_is_the_logarithm(rng):

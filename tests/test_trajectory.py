@@ -125,17 +125,6 @@ def test_half_the_speed_takes_about_twice_as_long(demo_plan, knee_phases):
     assert 1.7 < slow / fast < 2.0  # ramps and rests do not scale
 
 
-def test_a_joint_with_a_lower_speed_limit_of_its_own_keeps_it(demo_plan, knee_phases):
-    world = demo_plan.world
-    free = build_trajectory(world, knee_phases, speed=0.3)
-    dof = 6 + int(np.argmax(np.abs(free.v[:, 6:]).max(axis=0)))
-    v_max = world.v_max.copy()
-    v_max[dof] = 0.1
-    slow = build_trajectory(replace(world, v_max=v_max), knee_phases, speed=0.3)
-    assert np.abs(slow.v[:, dof]).max() <= 0.1 * 1.005
-    assert np.abs(free.v[:, dof]).max() > 0.25
-
-
 def test_it_starts_and_ends_at_rest(demo_plan):
     trajectory = demo_plan.trajectory
     start, end = round(HOLD_START * RATE), round(HOLD_END * RATE)

@@ -25,12 +25,11 @@ from clamber.contact.policy import (
     Place,
     climbed_edges,
     pelvis_angles,
-    wrap,
 )
 from clamber.contact.steps import SAME_PLACE
 from clamber.errors import InputError
 from clamber.model.scene import GROUND
-from clamber.model.se3 import matrix_from_quat
+from clamber.model.se3 import matrix_from_quat, wrap
 
 NEAR_EDGE = 1.0  # thighs' lengths: nearer than this, the pelvis is near an edge
 REGIONS: tuple[Region, ...] = ("G", "M", "O")

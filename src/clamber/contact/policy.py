@@ -26,6 +26,7 @@ import numpy as np
 from clamber.contact.contact import PARTS, Region, Stance
 from clamber.contact.scaling import near_edge
 from clamber.model.scene import Scene, Support
+from clamber.model.se3 import wrap
 
 Place = Literal["G", "M", "O", "goal"]
 PLACES: tuple[Place, ...] = ("G", "M", "O", "goal")
@@ -204,11 +205,6 @@ def _check_surfaces(names: tuple[str, ...]) -> None:
 
 
 # The pelvis over an obstacle.
-
-
-def wrap(angles: np.ndarray) -> np.ndarray:
-    """Angles in [-pi, pi) [rad]."""
-    return (np.asarray(angles) + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def pelvis_angles(R: np.ndarray) -> np.ndarray:

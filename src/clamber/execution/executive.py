@@ -36,6 +36,7 @@ from clamber.execution.servo import JointLaw
 from clamber.execution.terrain import believed_scene
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
+from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, chain_up, limb_links
 from clamber.planning.adaptation import (
     REACH,
@@ -355,8 +356,7 @@ class Execution:
             yield from self._check_stance()
             return
         q, ref = self._pose, self.reference
-        yaw = _yaw(q[3:7]) - _yaw(ref[3:7])
-        yaw = float((yaw + np.pi) % (2 * np.pi) - np.pi)
+        yaw = float(wrap(yaw_of(q[3:7]) - yaw_of(ref[3:7])))
         x, y, theta = self._world.scene.start
         c, s = np.cos(yaw), np.sin(yaw)
         rel = np.array([x, y]) - ref[:2]
@@ -839,8 +839,3 @@ def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
 def _arrival(t: Trajectory) -> int:
     """The sample from which on the last posture is held."""
     return len(t.time) - 1 - round(HOLD_END / PHYSICS_STEP)
-
-
-def _yaw(quat: np.ndarray) -> float:
-    w, x, y, z = quat
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

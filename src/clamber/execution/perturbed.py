@@ -16,7 +16,7 @@ from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
-from clamber.model.world import PHYSICS_STEP, World, build_world, index_world
+from clamber.model.world import PHYSICS_STEP, World, build_world, recompiled
 
 TILE = 0.1  # [m] side of the tiles of an uneven top, about
 SWELL = 0.15  # [m] standard deviation of the kernel that their heights are smoothed by
@@ -44,22 +44,18 @@ def disturbed_world(
     base = build_world(world.robot, scene)
     if d.unevenness == 0 and d.mass == 1 and d.effort == 1:
         return base
-    spec = mujoco.MjSpec.from_string(base.xml)
-    spec.modelfiledir = str(world.robot.path.parent)
-    rng = np.random.default_rng([d.seed, 2])
-    if d.unevenness > 0:
-        for b in scene.boxes:
-            _tile(spec, b, d.unevenness, rng)
-    for a in spec.actuators:
-        a.forcerange = [d.effort * float(x) for x in a.forcerange]
-    if d.mass != 1:
-        _weigh(spec, base.model, d.mass)
-    spec.compile()
-    xml = spec.to_xml()
-    # Written numbers are rounded: run what a reader of the file will simulate.
-    again = mujoco.MjSpec.from_string(xml)
-    again.modelfiledir = spec.modelfiledir
-    return index_world(again.compile(), xml, world.robot, scene)
+
+    def perturb(spec: mujoco.MjSpec) -> None:
+        rng = np.random.default_rng([d.seed, 2])
+        if d.unevenness > 0:
+            for b in scene.boxes:
+                _tile(spec, b, d.unevenness, rng)
+        for a in spec.actuators:
+            a.forcerange = [d.effort * float(x) for x in a.forcerange]
+        if d.mass != 1:
+            _weigh(spec, base.model, d.mass)
+
+    return recompiled(base, perturb)
 
 
 def disturbed_scene(scene: Scene, d: Disturbance) -> Scene:

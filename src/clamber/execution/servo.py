@@ -22,7 +22,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from clamber.model.world import PHYSICS_STEP, World, index_world
+from clamber.model.world import PHYSICS_STEP, World, recompiled
 
 ControlMode = Literal["pid", "mixed"]
 INTEGRAL_LIMIT = 5.0  # [N m] the integral term saturates here
@@ -37,19 +37,14 @@ def driven_world(world: World, mode: ControlMode) -> World:
     soft = world.robot.impedance
     if mode == "pid" or not soft:
         return world
-    spec = mujoco.MjSpec.from_string(world.xml)
-    spec.modelfiledir = str(world.robot.path.parent)
-    for name, (kp, kd) in soft.items():
-        spec.actuator(name).set_to_position(kp=kp, kv=kd)
-    spec.compile()
-    xml = spec.to_xml()
-    # Written numbers are rounded: run what a reader of the file will simulate.
-    again = mujoco.MjSpec.from_string(xml)
-    again.modelfiledir = spec.modelfiledir
+
+    def soften(spec: mujoco.MjSpec) -> None:
+        for name, (kp, kd) in soft.items():
+            spec.actuator(name).set_to_position(kp=kp, kv=kd)
+
     gains = {**world.robot.gains, **{n: (*g, 0.0) for n, g in soft.items()}}
     robot = replace(world.robot, gains=gains)
-    out = index_world(again.compile(), xml, robot, world.scene)
-    return replace(out, robot=world.robot)
+    return replace(recompiled(world, soften, robot), robot=world.robot)
 
 
 class JointLaw:

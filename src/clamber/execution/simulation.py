@@ -20,6 +20,7 @@ from clamber.execution.perturbed import disturbed_world, push_of
 from clamber.execution.sensors import Sensors
 from clamber.execution.servo import ControlMode, driven_world
 from clamber.model.scene import GROUND, Scene
+from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
@@ -373,9 +374,7 @@ def judge(plan: Plan, rollout: Rollout) -> Verdict:
             float(np.linalg.norm(last[:2] - xy)), GOAL_TOL
         )
         if len(world.scene.goal) == 3:
-            w, x, y, z = last[3:7]
-            yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-            off = float(abs((yaw - world.scene.goal[2] + np.pi) % (2 * np.pi) - np.pi))
+            off = float(abs(wrap(yaw_of(last[3:7]) - world.scene.goal[2])))
             goal["yaw to the goal [rad]"] = _at_most(off, float(YAW_TOL))
     return Verdict(reached=all(c.ok for c in goal.values()), criteria=goal)
 

@@ -72,6 +72,34 @@ def quat_conjugate(q: ArrayLike) -> np.ndarray:
     return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
+def quat_from_yaw(yaw: float) -> np.ndarray:
+    """Quaternion (4,) of a turn about z [rad]."""
+    return np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+
+
+def yaw_of(quat: ArrayLike) -> float:
+    """Yaw of a unit quaternion (4,): where its x axis points, seen from above [rad]."""
+    w, x, y, z = np.asarray(quat, dtype=float)
+    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def rpy_from_matrix(R: np.ndarray) -> np.ndarray:
+    """Fixed-axis angles (3,) of R (3, 3): `matrix_from_rpy` gives it back [rad].
+
+    Looking straight up or down, the yaw is zero: it turns about the axis of the roll.
+    """
+    pitch = math.atan2(-R[2, 0], math.hypot(R[0, 0], R[1, 0]))
+    if math.hypot(R[0, 0], R[1, 0]) < 1e-9:
+        return np.array([math.atan2(-R[1, 2], R[1, 1]), pitch, 0.0])
+    roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
+    return np.array([roll, pitch, yaw]) + 0.0  # no negative zeros
+
+
+def wrap(angles: ArrayLike) -> np.ndarray:
+    """Angles in [-pi, pi) [rad]."""
+    return (np.asarray(angles, dtype=float) + np.pi) % (2.0 * np.pi) - np.pi
+
+
 def turn_about_z(yaw: float) -> np.ndarray:
     """Rotation (2, 2) of the plane by a yaw [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)

@@ -11,7 +11,7 @@ are the floating base.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -22,7 +22,7 @@ from clamber.model.description import read_description
 from clamber.model.records import short_repr
 from clamber.model.robot import Robot, has_prefix, world_name
 from clamber.model.scene import GROUND, Scene, Support
-from clamber.model.se3 import matrix_from_quat
+from clamber.model.se3 import matrix_from_quat, quat_from_yaw
 
 PHYSICS_STEP = 0.001  # [s]
 SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
@@ -77,7 +77,6 @@ class World:
         xml: The MJCF text, geoms of surfaces renamed to begin with the surface's name.
         home: (nq,) standing at the scene's start, soles on the ground.
         q_min, q_max: (nv,) joint limits aligned with `v`; infinite for the base.
-        v_max: (nv,) speed limits; infinite for the base.
         tau_max: (na,) effort limits; joints: (na,) names.
         qadr, dadr: (na,) indices of the actuated joints in q and v.
         pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
@@ -89,7 +88,6 @@ class World:
 
     model: mujoco.MjModel
     xml: str
-    assets: Mapping[str, bytes]
     robot: Robot
     scene: Scene
     home: np.ndarray
@@ -101,7 +99,6 @@ class World:
     q_min: np.ndarray
     q_max: np.ndarray
     tau_max: np.ndarray
-    v_max: np.ndarray
     kp: np.ndarray
     kd: np.ndarray
     ki: np.ndarray
@@ -147,13 +144,36 @@ def build_world(robot: Robot, scene: Scene) -> World:
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.quality.shadowsize = 4096
     _add_scene(spec, scene)
+    return _written(spec, robot, scene)
+
+
+def recompiled(
+    world: World, edit: Callable[[mujoco.MjSpec], None], robot: Robot | None = None
+) -> World:
+    """The world whose model is edited.
+
+    Args:
+        world: Stays as it is.
+        edit: Changes the spec that it is given.
+        robot: With the gains that the edited model has; None: as before.
+    """
+    spec = mujoco.MjSpec.from_string(world.xml)
+    spec.modelfiledir = str(world.robot.path.parent)
+    edit(spec)
+    return _written(spec, robot or world.robot, world.scene)
+
+
+def _written(spec: mujoco.MjSpec, robot: Robot, scene: Scene) -> World:
+    """The world of the MJCF that a spec is written as.
+
+    Written numbers are rounded: whoever plans or simulates uses what a reader of the
+    file will.
+    """
     spec.compile()
     xml = spec.to_xml()
-    # Written numbers are rounded: plan with what a reader of the file will simulate.
     again = mujoco.MjSpec.from_string(xml)
     again.modelfiledir = str(robot.path.parent)
-    model = again.compile()
-    return index_world(model, xml, robot, scene)
+    return index_world(again.compile(), xml, robot, scene)
 
 
 def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
@@ -274,7 +294,6 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
     return World(
         model=model,
         xml=xml,
-        assets={},
         robot=robot,
         scene=scene,
         home=home,
@@ -289,7 +308,6 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         q_min=q_min,
         q_max=q_max,
         tau_max=tau_max,
-        v_max=np.full(model.nv, np.inf),
         kp=gains[:, 0],
         kd=gains[:, 1],
         ki=gains[:, 2],
@@ -407,8 +425,7 @@ def _stand(
     mid = np.mean(ankles, axis=0)
     out = home.copy()
     out[:3] = R @ (home[:3] - [mid[0], mid[1], low]) + [x, y, 0.0]
-    turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-    mujoco.mju_mulQuat(out[3:7], turn, home[3:7])
+    mujoco.mju_mulQuat(out[3:7], quat_from_yaw(yaw), home[3:7])
     return out
 
 

@@ -306,11 +306,10 @@ def retime(
         touch: The contact to be made at the end: gently.
     """
     w = kin.world
-    speed = np.minimum(JOINT_SPEED, w.v_max[w.dadr])
     polygons, x_max = [], np.empty(len(s))
     for i in range(len(s)):
         steep = np.maximum(np.abs(slope[i, w.dadr]), 1e-9)
-        x = float((speed / steep).min()) ** 2
+        x = float((JOINT_SPEED / steep).min()) ** 2
         kin.update(q[i])
         if touch is not None:
             n = w.supports[touch.support].normal

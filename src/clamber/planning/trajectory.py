@@ -297,7 +297,7 @@ def _on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.nda
     return q, np.concatenate([slope[:, :3], omega, slope[:, 7:]], axis=1)
 
 
-def _spline(kin: Kinematics, phase: Phase, speed: float, v_max: np.ndarray) -> _Spline:
+def _spline(kin: Kinematics, phase: Phase, speed: float) -> _Spline:
     nodes = phase.q.copy()
     for k in range(1, len(nodes)):
         if nodes[k, 3:7] @ nodes[k - 1, 3:7] < 0:
@@ -309,8 +309,7 @@ def _spline(kin: Kinematics, phase: Phase, speed: float, v_max: np.ndarray) -> _
     _, slope = _on_manifold(curve(fine), curve(fine, 1))
     slope = np.abs(slope)
     slope[:, :3] /= BASE_LENGTH
-    limit = np.minimum(speed, v_max)
-    cruise = float((limit / np.maximum(slope.max(axis=0), 1e-9)).min())
+    cruise = float((speed / np.maximum(slope.max(axis=0), 1e-9)).min())
     if not np.isfinite(cruise):
         return _Spline(curve, tau, float(s[-1]), cruise)
     cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
@@ -540,7 +539,7 @@ def _run(
             f"phase {i} ({phase.kind}) does not begin where the last one ended"
         )
     cruise = np.inf if speed == "max" else speed
-    spline = _spline(kin, phase, cruise, kin.world.v_max)
+    spline = _spline(kin, phase, cruise)
     timing = torque = None
     if speed == "max":
         made = _made(phases, i)

@@ -313,8 +313,7 @@ def _with_lead_in(
         raise InputError("more than 0 rad/s", source="--lead-in-speed", value=speed)
     world = motion.world
     way = motion.q[0, world.qadr] - measured
-    limit = np.minimum(speed, world.v_max[world.dadr])
-    seconds = PEAK * float((np.abs(way) / limit).max(initial=0.0))
+    seconds = PEAK * float((np.abs(way) / speed).max(initial=0.0))
     n = math.ceil(seconds * motion.rate)
     if n == 0:
         return motion

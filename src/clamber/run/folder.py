@@ -952,9 +952,7 @@ def _with_assets(world: World, folder: Path) -> str:
                 continue
             kind = "texturedir" if element.tag == "texture" else "meshdir"
             source = base / dirs.get(kind, dirs.get("assetdir", "")) / name
-            content = world.assets.get(name)
-            if content is None:
-                content = source.read_bytes()
+            content = source.read_bytes()
             if content not in names:
                 taken = set(names.values())
                 stem, suffix, n = Path(name).stem, Path(name).suffix, 2
