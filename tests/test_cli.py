@@ -18,7 +18,7 @@ from rich.console import Console
 
 import clamber
 from clamber import cli
-from clamber.cli import output as terminal
+from clamber.cli import commands, output
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
@@ -79,18 +79,11 @@ def test_version_is_that_of_the_package(
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        ([], "climb, contacts, plan"),
-        (["nonsense"], "nonsense"),
-        (["plan"], "SEQUENCE"),
-        (["climb", "--height", "abc"], "'abc'], expected FLOAT"),
-        (["climb", "--speed", "fast"], "--speed"),
-        (["climb", "--method", "luck"], "'direct', 'lbfgs', 'gradient'"),
         (["climb", "--height", "-1"], "--height is -1.0; expected a positive length"),
         (["climb", "--height", "nan"], "--height is nan; expected a finite number"),
         (["climb", "--robot", "nobody"], "--robot is 'nobody'; expected a robot.yaml"),
         (["climb", "--scene", "no.yaml"], "no.yaml: expected a readable file"),
         (["climb", "--scene", "a.yaml", "--height", "1"], "one of them alone"),
-        (["replan"], "SEQUENCE"),
         (["replan", "no.json"], "no.json: expected a readable file"),
         (["replan", "no", "--from", "3"], "no: expected a run folder"),
         (["climb", "--search.tries", "-1"], "--search.tries is -1; expected 0 or more"),
@@ -112,6 +105,28 @@ def test_a_mistake_is_one_sentence_on_stderr_and_exit_2(
     assert out == ""
     assert err.count("\n") == 1
     assert err.startswith("clamber: ")
+    assert said in err
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        ([], "climb, contacts, plan"),
+        (["nonsense"], "nonsense"),
+        (["plan"], "SEQUENCE"),
+        (["climb", "--height", "abc"], "--height"),
+        (["climb", "--hight", "1"], "--height"),
+        (["climb", "--speed", "fast"], "--speed"),
+        (["climb", "--method", "luck"], "gradient"),
+        (["replan"], "SEQUENCE"),
+    ],
+)
+def test_wrong_flags_are_named_on_stderr_and_exit_2(
+    args: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(args) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
     assert said in err
     assert "Traceback" not in err
 
@@ -173,7 +188,7 @@ def test_an_interrupt_is_one_sentence_and_exit_130(
     def interrupt(self: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli.SceneCommand, "run", interrupt)
+    monkeypatch.setattr(commands.SceneCommand, "run", interrupt)
     assert cli.main(["scene", str(scene_file)]) == 130
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -181,16 +196,16 @@ def test_an_interrupt_is_one_sentence_and_exit_130(
 def test_the_flags_of_planning_are_fields_of_its_options():
     from clamber.planning.records import Method, PlanOptions
 
-    flags, options = cli.PlanningFlags(), PlanOptions()
-    for f in fields(cli.PlanningFlags):
+    flags, options = commands.PlanningFlags(), PlanOptions()
+    for f in fields(commands.PlanningFlags):
         assert getattr(flags, f.name) == getattr(options, f.name)
-    shown = get_type_hints(cli.PlanningFlags)["method"]
+    shown = get_type_hints(commands.PlanningFlags)["method"]
     assert get_args(shown) == get_args(Method)
 
 
 def test_progress_on_a_log_is_one_line_for_each_tenth():
     log = io.StringIO()
-    report = terminal.progress_lines(Console(file=log, width=80))
+    report = output.progress_lines(Console(file=log, width=80))
     for k in range(200):
         report("plan", k / 200, f"move {k}")
     report("simulate", 1.0, "")
@@ -203,7 +218,7 @@ def test_progress_on_a_log_is_one_line_for_each_tenth():
 def test_progress_on_a_terminal_shows_stage_share_and_time_left():
     screen = io.StringIO()
     console = Console(file=screen, width=100, force_terminal=True)
-    with terminal.progress_bars(console) as report:
+    with output.progress_bars(console) as report:
         report("plan", 0.0, "LHand")
         report("plan", 0.5, "[RHand]")
         report("simulate", 0.2, "")
@@ -345,7 +360,7 @@ def test_the_clock_adds_up_what_was_tried_again(monkeypatch: pytest.MonkeyPatch)
     now = iter([0.0, 1.0, 3.0, 6.0, 10.0])
     monkeypatch.setattr(time, "perf_counter", lambda: next(now))
     seen = []
-    clock = cli.Clock()
+    clock = output.Clock()
     report = clock.watching(lambda *step: seen.append(step))
     for step in (("a", 0.0), ("b", 0.5), ("a", 0.0), ("b", 0.5)):
         report("plan", step[1], step[0])
@@ -779,7 +794,7 @@ def test_flags_of_a_picture_that_do_not_fit_are_one_sentence(
     [("1080p", (1920, 1080)), ("480p", (854, 480)), ("2160p", (3840, 2160))],
 )
 def test_sizes_by_their_lines_are_16_to_9(text: str, size: tuple[int, int]):
-    assert cli._picture_size(text) == size
+    assert commands._picture_size(text) == size
 
 
 # Learning.

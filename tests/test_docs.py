@@ -33,6 +33,7 @@ import yaml
 
 import clamber
 from clamber import cli
+from clamber.cli import parse
 from clamber.errors import InputError
 from conftest import ROOT
 
@@ -130,7 +131,7 @@ def flags_of(command: str) -> frozenset[str]:
 
 COMMANDS = frozenset(
     re.findall(
-        r'subcommand\("(\w+)"\)', (ROOT / "src/clamber/cli/__init__.py").read_text()
+        r'subcommand\("(\w+)"\)', (ROOT / "src/clamber/cli/commands.py").read_text()
     )
 )
 
@@ -143,11 +144,14 @@ def check_command(words: Sequence[str]) -> None:
     """
     program, *rest = words
     if program == "clamber":
-        if rest[0] in ("--version", "--help", "--completion") or "--help" in rest:
+        if (
+            rest[0] in ("--version", "--help", "--tyro-print-completion")
+            or "--help" in rest
+        ):
             return
         if rest[0] in ("--json", "--quiet"):
             rest = [*rest[1:], rest[0]]
-        cli._parse([w for w in rest if w not in (">", "|")][: _redirected(rest)])
+        parse([w for w in rest if w not in (">", "|")][: _redirected(rest)])
     elif program == "make":
         known = re.findall(r"^([a-z0-9-]+):", (ROOT / "Makefile").read_text(), re.M)
         for target in rest:
@@ -222,7 +226,7 @@ class Session:
                 with pytest.MonkeyPatch.context() as patch:
                     if words[1] == "view":  # a person looks, and presses Ctrl-C
                         pytest.importorskip("viser")
-                        patch.setattr(cli, "time", SimpleNamespace(sleep=_interrupted))
+                        patch.setattr(cli.commands, "time", SimpleNamespace(sleep=_interrupted))
                     code = cli.main(list(words[1:end]))
             elif words[:2] == ["python", "-c"]:
                 exec(compile(words[2], "<docs>", "exec"), {})
@@ -388,7 +392,7 @@ def test_commands_within_the_text_exist(page: Path):
         if words[1] in ("COMMAND", "..."):  # any of them
             continue
         if words[1].startswith("--"):
-            assert words[1] in ("--help", "--version", "--completion"), span
+            assert words[1] in ("--help", "--version", "--tyro-print-completion"), span
             continue
         assert words[1] in COMMANDS, f"{page.name}: {span}"
         for word in words[2:]:

