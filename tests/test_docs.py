@@ -226,7 +226,9 @@ class Session:
                 with pytest.MonkeyPatch.context() as patch:
                     if words[1] == "view":  # a person looks, and presses Ctrl-C
                         pytest.importorskip("viser")
-                        patch.setattr(cli.commands, "time", SimpleNamespace(sleep=_interrupted))
+                        patch.setattr(
+                            cli.commands, "time", SimpleNamespace(sleep=_interrupted)
+                        )
                     code = cli.main(list(words[1:end]))
             elif words[:2] == ["python", "-c"]:
                 exec(compile(words[2], "<docs>", "exec"), {})
