@@ -10,7 +10,7 @@ import pytest
 
 from clamber.errors import InputError
 from clamber.execution.disturbance import LIMITS, Disturbance
-from clamber.execution.perturbed import disturbed_scene, push_of
+from clamber.execution.perturbed import perturbed_scene, push_of
 from clamber.model.scene import Scene
 
 NAMES = tuple(f.name for f in fields(Disturbance))
@@ -92,7 +92,7 @@ def test_there_are_sensible_signs():
 def test_by_default_nothing_differs():
     d = Disturbance()
     scene = Scene.from_height(0.275)
-    same = disturbed_scene(scene, d)
+    same = perturbed_scene(scene, d)
     assert not d.changes_world
     assert push_of(d, 10.0) is None
     assert d.friction is None

@@ -15,8 +15,8 @@ from clamber.execution.perturbed import (
     PUSH_MARGIN,
     PUSH_TIME,
     TILE,
-    disturbed_scene,
-    disturbed_world,
+    perturbed_scene,
+    perturbed_world,
     push_of,
 )
 from clamber.execution.simulation import simulate
@@ -60,7 +60,7 @@ def world(coman, scene) -> World:
 
 @pytest.fixture(scope="module")
 def uneven(world) -> World:
-    return disturbed_world(world, Disturbance(unevenness=0.04))
+    return perturbed_world(world, Disturbance(unevenness=0.04))
 
 
 def corner(box: Box, x: float, y: float, z: float) -> np.ndarray:
@@ -113,16 +113,16 @@ def tops_of(world: World, box: Box) -> np.ndarray:
 
 
 def test_without_a_difference_it_is_the_world_itself(world):
-    assert disturbed_world(world, Disturbance()) is world
+    assert perturbed_world(world, Disturbance()) is world
     run_only = Disturbance(delay=0.01, noise=3.0, push=50.0, seed=4)
-    assert disturbed_world(world, run_only) is world
+    assert perturbed_world(world, run_only) is world
 
 
 def test_another_true_scene_is_built_and_disturbed_in_its_turn(world, coman):
     truth = Scene.from_height(0.2)
-    plain = disturbed_world(world, Disturbance(), truth)
+    plain = perturbed_world(world, Disturbance(), truth)
     assert plain.xml == build_world(coman, truth).xml
-    higher = disturbed_world(world, Disturbance(height=0.05), truth)
+    higher = perturbed_world(world, Disturbance(height=0.05), truth)
     assert higher.supports["box"].position[2] == pytest.approx(0.25)
 
 
@@ -131,7 +131,7 @@ def test_another_true_scene_is_built_and_disturbed_in_its_turn(world, coman):
 
 @pytest.mark.parametrize("height", [0.05, -0.05])
 def test_boxes_are_higher_and_stay_on_the_ground(world, scene, height):
-    there, rise = disturbed_world(world, Disturbance(height=height)), [0, 0, height]
+    there, rise = perturbed_world(world, Disturbance(height=height)), [0, 0, height]
     for b in scene.boxes:
         for x in (-1, 1):
             for y in (-1, 1):
@@ -155,7 +155,7 @@ def test_a_box_on_its_side_is_disturbed_as_it_lies(scene, turn):
     d = Disturbance(height=0.04)
 
     def corners(box: Box) -> np.ndarray:
-        higher = disturbed_scene(replace(scene, boxes=(box,)), d).boxes[0]
+        higher = perturbed_scene(replace(scene, boxes=(box,)), d).boxes[0]
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         points = higher.position + 0.5 * signs * higher.size @ higher.rotation.T
         return points[np.lexsort(points.round(6).T)]
@@ -165,7 +165,7 @@ def test_a_box_on_its_side_is_disturbed_as_it_lies(scene, turn):
 
 @pytest.mark.parametrize("pitch", [0.2, -0.2])
 def test_a_pitch_sinks_the_far_end_and_leaves_the_near_edge(world, scene, pitch):
-    there = disturbed_world(world, Disturbance(pitch=pitch))
+    there = perturbed_world(world, Disturbance(pitch=pitch))
     for b in scene.boxes:
         length = b.size[0]
         for y in (-1, 1):
@@ -180,7 +180,7 @@ def test_a_pitch_sinks_the_far_end_and_leaves_the_near_edge(world, scene, pitch)
 
 def test_a_roll_turns_about_the_middle_of_the_near_edge(world, scene):
     roll = 0.15
-    there = disturbed_world(world, Disturbance(roll=roll))
+    there = perturbed_world(world, Disturbance(roll=roll))
     for b in scene.boxes:
         middle = geom_corner(there, b.name, -1, 0, 1)
         assert np.allclose(middle, corner(b, -1, 0, 1), atol=1e-6)
@@ -192,7 +192,7 @@ def test_a_roll_turns_about_the_middle_of_the_near_edge(world, scene):
 
 def test_a_tilt_is_a_turn_of_the_box_in_its_own_frame(scene):
     d = Disturbance(roll=0.1, pitch=-0.2, height=0.03)
-    for a, b in zip(disturbed_scene(scene, d).boxes, scene.boxes, strict=True):
+    for a, b in zip(perturbed_scene(scene, d).boxes, scene.boxes, strict=True):
         turn = Rotation.from_matrix(b.rotation.T @ a.rotation)
         assert np.allclose(turn.as_euler("xyz"), [0.1, -0.2, 0.0], atol=1e-12)
         edge = corner(a, -1, 0, 1) - corner(b, -1, 0, 1)
@@ -201,7 +201,7 @@ def test_a_tilt_is_a_turn_of_the_box_in_its_own_frame(scene):
 
 def test_the_robot_starts_off_by_what_is_said(world, scene):
     d = Disturbance(x=0.03, y=-0.02, yaw=0.1)
-    there = disturbed_world(world, d)
+    there = perturbed_world(world, d)
     assert np.allclose(there.scene.start - scene.start, [0.03, -0.02, 0.1])
     ankles = []
     for w in (world, there):
@@ -224,8 +224,8 @@ def test_the_robot_starts_off_by_what_is_said(world, scene):
 @pytest.mark.parametrize("height", [-0.2901, -0.5])
 def test_a_box_that_would_vanish_is_the_users_mistake(world, height):
     with pytest.raises(InputError, match=r"disturb\.height is .*\(box is 0\.3 m high"):
-        disturbed_world(world, Disturbance(height=height))
-    disturbed_scene(world.scene, Disturbance(height=-0.28))  # as low as it may be
+        perturbed_world(world, Disturbance(height=height))
+    perturbed_scene(world.scene, Disturbance(height=-0.28))  # as low as it may be
 
 
 # Friction, mass, effort.
@@ -234,7 +234,7 @@ def test_a_box_that_would_vanish_is_the_users_mistake(world, height):
 def test_friction_is_what_mujocos_contacts_have(world):
     """A foot on the ground, and one on the box: the supports' friction counts."""
     for friction in (None, 0.3):
-        there = disturbed_world(world, Disturbance(friction=friction, x=0.5))
+        there = perturbed_world(world, Disturbance(friction=friction, x=0.5))
         expected = {"ground": friction or 0.9, "box": friction or 0.7}
         for support, mu in expected.items():
             data = mujoco.MjData(there.model)
@@ -252,7 +252,7 @@ def test_friction_is_what_mujocos_contacts_have(world):
 
 
 def test_mass_and_inertia_of_all_links_are_multiplied(world):
-    there = disturbed_world(world, Disturbance(mass=1.3))
+    there = perturbed_world(world, Disturbance(mass=1.3))
     a, b = world.model, there.model
     assert np.allclose(b.body_mass, 1.3 * a.body_mass, rtol=1e-5)
     assert np.allclose(b.body_inertia, 1.3 * a.body_inertia, rtol=1e-4, atol=1e-9)
@@ -264,7 +264,7 @@ def test_mass_and_inertia_of_all_links_are_multiplied(world):
 
 def test_the_mass_matrix_is_multiplied_up_to_the_rotors(world):
     """An independent look: M = factor * M_links + armature."""
-    there = disturbed_world(world, Disturbance(mass=1.3))
+    there = perturbed_world(world, Disturbance(mass=1.3))
     M = []
     for w in (world, there):
         data, full = mujoco.MjData(w.model), np.zeros((w.model.nv, w.model.nv))
@@ -279,7 +279,7 @@ def test_the_mass_matrix_is_multiplied_up_to_the_rotors(world):
 
 
 def test_effort_limits_are_multiplied_and_saturate(world):
-    there = disturbed_world(world, Disturbance(effort=0.4))
+    there = perturbed_world(world, Disturbance(effort=0.4))
     assert np.allclose(there.tau_max, 0.4 * world.tau_max, rtol=1e-6)
     data = mujoco.MjData(there.model)
     data.qpos[:] = there.home
@@ -291,10 +291,10 @@ def test_effort_limits_are_multiplied_and_saturate(world):
 
 def test_one_disturbance_changes_nothing_else(world):
     a = world.model
-    b = disturbed_world(world, Disturbance(mass=1.3)).model
+    b = perturbed_world(world, Disturbance(mass=1.3)).model
     assert np.array_equal(a.geom_pos, b.geom_pos)
     assert np.array_equal(a.actuator_forcerange, b.actuator_forcerange)
-    c = disturbed_world(world, Disturbance(effort=0.4)).model
+    c = perturbed_world(world, Disturbance(effort=0.4)).model
     assert np.array_equal(a.body_mass, c.body_mass)
     assert np.array_equal(a.geom_friction, c.geom_friction)
     for m in (b, c):
@@ -380,27 +380,27 @@ def test_neighbouring_tiles_are_alike(uneven, scene):
 
 def test_tiles_follow_a_tilted_box(world, scene):
     d = Disturbance(unevenness=0.03, pitch=0.2, height=0.05)
-    there = disturbed_world(world, d)
-    for b in disturbed_scene(scene, d).boxes:
+    there = perturbed_world(world, d)
+    for b in perturbed_scene(scene, d).boxes:
         off = tops_of(there, b)
         assert np.abs(off).max() == pytest.approx(0.03, abs=2e-6)
 
 
 def test_a_low_box_keeps_its_tiles_above_ground(world, coman):
     low = build_world(coman, Scene.from_height(0.05))
-    there = disturbed_world(low, Disturbance(unevenness=0.15))
+    there = perturbed_world(low, Disturbance(unevenness=0.15))
     for name in tiles_of(there, "box").values():
         assert there.model.geom(name).size[2] >= 0.001 - 1e-9
 
 
 def test_the_same_seed_has_the_same_tiles_and_another_seed_others(world, uneven, scene):
-    again = disturbed_world(world, Disturbance(unevenness=0.04))
+    again = perturbed_world(world, Disturbance(unevenness=0.04))
     assert again.xml == uneven.xml
     assert np.array_equal(again.model.geom_pos, uneven.model.geom_pos)
-    other = disturbed_world(world, Disturbance(unevenness=0.04, seed=1))
+    other = perturbed_world(world, Disturbance(unevenness=0.04, seed=1))
     for b in scene.boxes:
         assert np.abs(tops_of(other, b) - tops_of(uneven, b)).max() > 0.01
-    twice = disturbed_world(world, Disturbance(unevenness=0.02))
+    twice = perturbed_world(world, Disturbance(unevenness=0.02))
     for b in scene.boxes:
         assert np.allclose(tops_of(twice, b), 0.5 * tops_of(uneven, b), atol=3e-6)
 
@@ -423,7 +423,7 @@ def test_the_two_boxes_are_warped_differently(uneven, scene):
     ids=["scene", "tiles"],
 )
 def test_whoever_loads_the_written_world_has_the_same_model(world, d):
-    there = disturbed_world(world, d)
+    there = perturbed_world(world, d)
     loaded = mujoco.MjModel.from_xml_string(there.xml)
     for name in (
         *("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_solref"),

@@ -24,7 +24,7 @@ PUSH_TIME = 0.2  # [s]
 PUSH_MARGIN = 0.5  # [s] no push begins earlier, or ends later before the end
 
 
-def disturbed_world(
+def perturbed_world(
     world: World, disturbance: Disturbance, truth: Scene | None = None
 ) -> World:
     """The world that physics runs.
@@ -40,7 +40,7 @@ def disturbed_world(
     d = disturbance
     if truth is None and not d.changes_world:
         return world
-    scene = disturbed_scene(world.scene if truth is None else truth, d)
+    scene = perturbed_scene(world.scene if truth is None else truth, d)
     base = build_world(world.robot, scene)
     if d.unevenness == 0 and d.mass == 1 and d.effort == 1:
         return base
@@ -58,7 +58,7 @@ def disturbed_world(
     return recompiled(base, perturb)
 
 
-def disturbed_scene(scene: Scene, d: Disturbance) -> Scene:
+def perturbed_scene(scene: Scene, d: Disturbance) -> Scene:
     """The scene with other heights, tilts, friction and start; tiles aside."""
     boxes = []
     for b in map(_upright, scene.boxes):

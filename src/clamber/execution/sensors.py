@@ -55,9 +55,7 @@ class Sensors:
         self._model = m
         self._noise, self._rng = noise, rng
         self._qadr = world.qadr
-        self._row = np.where(m.body_weldid[m.geom_bodyid] == 0, -1, -2)
-        for i, s in enumerate(world.surfaces):
-            self._row[list(world.surfaces[s].geoms)] = i
+        self._row = rows_of_geoms(world)
         self._surfaces = len(world.surfaces)
         self._late = round(delay / PHYSICS_STEP)
         self._ring: list[Measurement] = []
@@ -101,35 +99,50 @@ class Sensors:
         return self._ring[self._k % (self._late + 1)]
 
 
-def surface_forces(
-    data: mujoco.MjData, row_of_geom: np.ndarray, surfaces: int
-) -> np.ndarray:
-    """(surfaces, 3) contact forces of the environment on each surface [N], world.
+def rows_of_geoms(world: World) -> np.ndarray:
+    """(ngeom,) the index of a geom's surface; -1: of another link; -2: of the scene."""
+    m = world.model
+    out = np.where(m.body_weldid[m.geom_bodyid] == 0, -2, -1)
+    for i, surface in enumerate(world.surfaces.values()):
+        out[list(surface.geoms)] = i
+    return out
+
+
+def contact_forces(
+    data: mujoco.MjData, row_of_geom: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Contacts of the robot with the scene, and the force of each on the robot.
 
     Elliptic cones: the rows of a contact begin with its normal force, then the two
     tangential ones, along the axes of its frame.
 
     Args:
         data: After a step.
-        row_of_geom: (ngeom,) index of the surface that a geom belongs to; -1 for the
-            environment, -2 for other parts of the robot.
-        surfaces: Their number.
+        row_of_geom: (ngeom,) as `rows_of_geoms` gives it.
+
+    Returns:
+        (k, 2) geoms of the robot and of the scene, (k,) normal forces [N] and (k, 3)
+        forces on the robot in the world [N].
     """
-    out = np.zeros((surfaces, 3))
     if data.ncon == 0:
-        return out
+        return np.zeros((0, 2), dtype=int), np.zeros(0), np.zeros((0, 3))
     c = data.contact
-    address = c.efc_address
-    rows = row_of_geom[c.geom]
-    one, other = rows.max(axis=1), rows.min(axis=1)
-    use = (address >= 0) & (one >= 0) & (other == -1)
-    if not use.any():
-        return out
-    address = address[use]
-    frame = c.frame[use].reshape(-1, 3, 3)
+    of_scene = row_of_geom[c.geom] == -2
+    use = (c.efc_address >= 0) & (of_scene[:, 0] != of_scene[:, 1])
+    address, frame = c.efc_address[use], c.frame[use].reshape(-1, 3, 3)
     f = data.efc_force[address[:, None] + np.arange(3)]
-    world = np.einsum("ij,ijk->ik", f, frame)
-    second = rows[use, 1] >= 0  # the force acts on the second geom
+    second = of_scene[use, 0]  # the force acts on the second geom
     sign = np.where(second, 1.0, -1.0)[:, None]
-    np.add.at(out, rows[use].max(axis=1), sign * world)
+    geoms = np.where(second[:, None], c.geom[use][:, ::-1], c.geom[use])
+    return geoms, f[:, 0], sign * np.einsum("ij,ijk->ik", f, frame)
+
+
+def surface_forces(
+    data: mujoco.MjData, row_of_geom: np.ndarray, surfaces: int
+) -> np.ndarray:
+    """(surfaces, 3) forces of the scene on each surface, of that many [N], world."""
+    geoms, _, force = contact_forces(data, row_of_geom)
+    row = row_of_geom[geoms[:, 0]]
+    out = np.zeros((surfaces, 3))
+    np.add.at(out, row[row >= 0], force[row >= 0])
     return out

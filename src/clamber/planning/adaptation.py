@@ -291,7 +291,7 @@ def feeling(
     v[:, world.dadr] *= inside == q[:, world.qadr]
     q[:, world.qadr] = inside
     cut |= {"q": q, "v": v}
-    return replace(t, time=t.time[: b - a], **cut)
+    return replace(t, time=t.time[: b - a], segments=(), **cut)
 
 
 def _nodes_below(

@@ -139,6 +139,28 @@ class Samples:
         return self._held
 
 
+
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Segment:
+    """A stretch of a trajectory while the same contacts are closed.
+
+    Attributes:
+        kind: `hold` of the first or last posture, or that of a phase.
+        change: Which contact change it is part of, counted from 0; None before the
+            first of them, and where a posture is held.
+        begin, end: Its first sample, and the first one after it.
+        makes: The contact that is closed from `end` on, if any.
+    """
+
+    kind: str
+    change: int | None
+    begin: int
+    end: int
+    makes: Contact | None = None
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Trajectory:
     """A timed reference.
@@ -150,6 +172,7 @@ class Trajectory:
         contact: (T, nS) bool, closed contacts by `surfaces`.
         joints: (na,) names.
         keyframes: (K,) time at which each keyframe is reached [s].
+        segments: What the samples are part of, in order; empty where nobody knows.
     """
 
     time: np.ndarray
@@ -160,6 +183,7 @@ class Trajectory:
     surfaces: tuple[str, ...]
     joints: tuple[str, ...]
     keyframes: np.ndarray
+    segments: tuple[Segment, ...] = ()
 
     def __post_init__(self) -> None:
         """Check shapes, make arrays read-only."""
@@ -174,15 +198,6 @@ class Trajectory:
     def at(self, t: float) -> int:
         """Index of the sample at time `t` [s], clipped to the ends."""
         return int(np.clip(round(t * RATE), 0, len(self.time) - 1))
-
-    def velocity_error(self, world: World) -> float:
-        """Largest difference of v and the central difference of q [rad/s, m/s]."""
-        kin = Kinematics(world)
-        worst = 0.0
-        for k in range(1, len(self.time) - 1, 7):
-            v = kin.difference(self.q[k - 1], self.q[k + 1]) * (RATE / 2)
-            worst = max(worst, float(np.abs(v - self.v[k]).max()))
-        return worst
 
 
 def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
@@ -481,7 +496,30 @@ def build_trajectory(
         surfaces=surfaces,
         joints=world.joints,
         keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
+        segments=_segments(phases, stops.tolist(), keyframe_after),
     )
+
+
+def _segments(
+    phases: Sequence[Phase], stops: Sequence[int], keyframe_after: Sequence[int]
+) -> tuple[Segment, ...]:
+    """The stretches of phases that end before the samples `stops`."""
+    start, still = round(HOLD_START * RATE), stops[-1] - round(HOLD_END * RATE)
+    out = [Segment(kind="hold", change=None, begin=0, end=start)]
+    for i, phase in enumerate(phases):
+        # As many keyframes as are reached before it, less the first.
+        change = int(np.searchsorted(keyframe_after, i, side="right")) - 1
+        out.append(
+            Segment(
+                kind=phase.kind,
+                change=change if change >= 0 else None,
+                begin=out[-1].end,
+                end=min(stops[i], still),
+                makes=_made(phases, i),
+            )
+        )
+    out.append(Segment(kind="hold", change=None, begin=still, end=stops[-1]))
+    return tuple(out)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

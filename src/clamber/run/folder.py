@@ -19,7 +19,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import IO, Any, TypeVar, get_args, get_type_hints
 from xml.etree import ElementTree
@@ -54,7 +54,7 @@ from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import World, index_world
 from clamber.planning.records import Iteration, Midway, Plan, PlanOptions
 from clamber.planning.substitutes import Replanned
-from clamber.planning.trajectory import Samples, Trajectory
+from clamber.planning.trajectory import Samples, Segment, Trajectory
 from clamber.step.ik import Residuals
 from clamber.step.posture import Keyframe
 from clamber.step.stability import ContactState, contact_points
@@ -1132,8 +1132,27 @@ def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
             "contact": x.contact,
             "tau": x.tau,
             "keyframes": x.keyframes,
+            "segments": [json.dumps(_segment_fields(x)) for x in x.segments],
         },
     )
+
+
+def _segment_fields(x: Segment) -> dict[str, Any]:
+    makes = None if x.makes is None else contact_fields(x.makes)
+    fields = {k: np.asarray(v).tolist() for k, v in (makes or {}).items()}
+    return asdict(replace(x, makes=None)) | {"makes": fields or None}
+
+
+class _SegmentFile(pydantic.BaseModel):
+    kind: str
+    change: int | None
+    begin: int
+    end: int
+    makes: _ContactFile | None
+
+    def segment(self) -> Segment:
+        makes = None if self.makes is None else self.makes.contact()
+        return Segment(**self.model_dump(exclude={"makes"}), makes=makes)
 
 
 def load_trajectory(path: str | Path, world: World) -> Trajectory:
@@ -1167,7 +1186,16 @@ def load_trajectory(path: str | Path, world: World) -> Trajectory:
         surfaces=surfaces,
         joints=joints,
         keyframes=f.get("keyframes", None),
+        segments=_segments(f),
     )
+
+
+def _segments(f: _Arrays) -> tuple[Segment, ...]:
+    try:
+        rows = [_SegmentFile.model_validate_json(x) for x in f.get("segments", None)]
+    except pydantic.ValidationError as e:
+        raise InputError("segments as JSON", source=f.path, field="segments") from e
+    return tuple(x.segment() for x in rows)
 
 
 def save_timings(folder: str | Path, seconds: Mapping[str, float]) -> None:
