@@ -22,6 +22,8 @@ from pathlib import Path
 import numpy as np
 
 import clamber
+from clamber.execution.events import Replanned
+from clamber.execution.verdict import Figure
 
 SEED = 2026
 # [m] Of the box ahead of the robot, of the goal behind the box. With the start nearer
@@ -90,13 +92,13 @@ def cross(
     c = verdict.criteria
     broken = [f"{k}: {v.value:.3g}" for k, v in c.items() if not v.ok]
     if not verdict.reached and rollout.events:
-        broken.append(f"at {rollout.events[-1].time:.0f} s {rollout.events[-1].text}")
-    again = sum("planned again" in e.text for e in rollout.events)
+        broken.append(f"at {rollout.events[-1].time:.0f} s {rollout.events[-1]}")
+    again = sum(isinstance(e, Replanned) for e in rollout.events)
     return out | {
         **{"reached": verdict.reached, "planned_again": again},
         "motion_s": f"{len(rollout.ctrl) / 1e3:.0f}",
-        "to_goal": f"{c['pelvis to the goal [m]'].value:.3f}",
-        "effort": f"{c['largest effort, share of the limit'].value:.2f}",
+        "to_goal": f"{c[Figure.GOAL].value:.3f}",
+        "effort": f"{c[Figure.EFFORT].value:.2f}",
         "why": "; ".join(broken),
     }
 

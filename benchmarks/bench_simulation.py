@@ -16,7 +16,8 @@ import time
 import mujoco
 import numpy as np
 
-from clamber.execution.simulation import judge, simulate
+from clamber.execution.simulation import simulate
+from clamber.execution.verdict import judge
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import PHYSICS_STEP

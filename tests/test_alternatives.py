@@ -14,7 +14,8 @@ from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.contact.steps import Skipped, split_moves
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
-from clamber.execution.simulation import judge, simulate
+from clamber.execution.simulation import simulate
+from clamber.execution.verdict import judge
 from clamber.model.kinematics import Kinematics
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene

@@ -155,7 +155,8 @@ def test_the_angle_to_a_normal_is_that_to_the_vertical_turned(rng):
     "rpy", [(0, -0.1745, 0), (0, 0.1745, 0), (0.1745, 0, 0), (0, 0.3491, 0)]
 )
 def test_a_slope_is_climbed_in_physics(coman, demo_sequence, rpy):
-    from clamber.execution.simulation import judge, simulate
+    from clamber.execution.simulation import simulate
+    from clamber.execution.verdict import judge
     from clamber.planning.planner import plan
 
     R, size = matrix_from_rpy(rpy), np.array([1.0, 1.2, 0.5])

@@ -19,6 +19,8 @@ from rich.console import Console
 import clamber
 from clamber import cli
 from clamber.cli import commands, output
+from clamber.execution.events import Lost
+from clamber.execution.verdict import Figure
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
@@ -253,7 +255,7 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         instead="",
         trajectory="timed",
     )
-    event = clamber.Event(time=7.25, text="LHand touches 30 mm below")
+    event = Lost(time=7.25, surface="LHand")
     criterion = SimpleNamespace(value=0.0123, limit=0.05, ok=True)
     verdict = SimpleNamespace(reached=True, criteria={"speed [m/s]": criterion})
     s = SimpleNamespace(
@@ -627,10 +629,9 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
     assert cli.main(command) == 1
     record = json.loads(capsys.readouterr().out)
     assert record["reached"] is False
-    on_top = record["criteria"]["share of the weight at the end on obstacles"]
+    on_top = record["criteria"][Figure.LOAD_ON_OBSTACLES]
     assert 0.0 < on_top["value"] < 0.5
-    held = "share of the weight at the end on planned contacts"
-    assert record["criteria"][held]["ok"] is True
+    assert record["criteria"][Figure.LOAD_ON_PLAN]["ok"] is True
     assert {p.name for p in run_folder.iterdir()} == {
         "sequence.json",
         "plan.json",

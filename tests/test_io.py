@@ -17,7 +17,8 @@ from clamber.contact.contact import Contact, ContactInterval, ContactSequence, S
 from clamber.contact.steps import Skipped
 from clamber.errors import InputError, Status
 from clamber.execution.disturbance import Disturbance
-from clamber.execution.simulation import Criterion, Rollout, Verdict
+from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Criterion, Verdict
 from clamber.model.robot import ROBOTS
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy

@@ -13,6 +13,7 @@ from clamber import cli
 from clamber.cli import commands, parse
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
+from clamber.execution.verdict import Figure
 from clamber.study.climb import FLAGS, Job, command_of, job_of, run_job
 
 
@@ -153,9 +154,9 @@ def test_the_command_of_a_row_gives_its_verdict(
     record = json.loads(capsys.readouterr().out)
     assert code == (0 if outcome.reached else 1)
     assert record["reached"] == outcome.reached
-    largest = record["criteria"]["largest effort, share of the limit"]["value"]
+    largest = record["criteria"][Figure.EFFORT]["value"]
     assert outcome.effort == pytest.approx(largest, abs=1e-6)
-    again = sum(e["text"].startswith("planned again") for e in record["events"])
+    again = sum(e["type"] == "Replanned" for e in record["events"])
     assert outcome.replans == again
     if not outcome.reached and outcome.why in record["criteria"]:
         assert not record["criteria"][outcome.why]["ok"]

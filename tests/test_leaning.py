@@ -17,7 +17,8 @@ from clamber.execution.leaning import (
     strikes,
     striking_part,
 )
-from clamber.execution.simulation import judge, simulate
+from clamber.execution.simulation import simulate
+from clamber.execution.verdict import judge
 from clamber.model.kinematics import Kinematics
 
 

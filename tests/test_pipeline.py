@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from clamber.errors import InputError, Status
-from clamber.execution.simulation import judge, simulate
+from clamber.execution.simulation import simulate
+from clamber.execution.verdict import judge
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import Box, Scene
 from clamber.planning.planner import VARIATIONS, plan

@@ -545,7 +545,8 @@ def test_a_thumb_of_more_joints_than_a_finger_is_no_part_of_the_arm(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 1.0])
 def test_a_new_robot_climbs_its_own_knee_height(proposed, demo_sequence, share):
-    from clamber.execution.simulation import judge, simulate
+    from clamber.execution.simulation import simulate
+    from clamber.execution.verdict import judge
     from clamber.planning.planner import plan
 
     _, robot, _ = proposed

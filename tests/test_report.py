@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import clamber
 from clamber import cli
 from clamber.errors import InputError
+from clamber.execution.events import Lost, Stopped
 from clamber.execution.simulation import STRIDE, Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
@@ -222,15 +222,15 @@ def test_the_table_of_stances_has_the_figures_of_the_plan(whole: Path, plan: Pla
 def test_a_fall_and_a_stop_and_what_was_felt_are_told(
     plan: Plan, rollout: Rollout, tmp_path: Path
 ):
-    event = clamber.Event(time=0.5, text="LHand touches 30 mm early")
+    events = (Lost(time=0.5, surface="LHand"), Stopped(time=0.5, why="nothing to hold"))
     io.save_plan(plan, tmp_path)
-    fallen = replace(rollout, fell=True, stopped="nothing to hold", events=(event,))
+    fallen = replace(rollout, fell=True, events=events)
     io.save_rollout(plan, fallen, tmp_path)
     record = report.run_record(tmp_path)
     assert record["fell"]
     assert record["stopped"] == "nothing to hold"
-    assert record["events"] == [{"time": 0.5, "text": "LHand touches 30 mm early"}]
-    assert record["motion"]["felt"] == [0.5]
+    assert [e["text"] for e in record["events"]] == [str(e) for e in events]
+    assert record["motion"]["felt"] == [0.5, 0.5]
     assert [m for m in record["missing"] if m.startswith("verdict.json")]
 
 

@@ -171,7 +171,7 @@ def test_a_contact_is_made_gently(demo_plan, demo_kinematics, knee_phases, fast)
 
 
 def test_it_is_faster_than_any_cruise_and_the_same_every_time(
-    demo_plan, knee_phases, fast
+    demo_plan, demo_kinematics, knee_phases, fast
 ):
     again = build_trajectory(demo_plan.world, knee_phases, speed="max")
     assert np.array_equal(fast.q, again.q)
@@ -179,7 +179,9 @@ def test_it_is_faster_than_any_cruise_and_the_same_every_time(
     slow = build_trajectory(demo_plan.world, knee_phases, speed=3.0)
     hold = HOLD_START + HOLD_END
     assert fast.time[-1] - hold < 0.8 * (slow.time[-1] - hold)
-    assert fast.velocity_error(demo_plan.world) < 2e-3
+    for k in range(1, len(fast.time) - 1, 7):
+        v = demo_kinematics.difference(fast.q[k - 1], fast.q[k + 1]) * RATE / 2
+        assert np.abs(v - fast.v[k]).max() < 2e-3
 
 
 def test_a_run_folder_keeps_the_word_max_and_numbers():

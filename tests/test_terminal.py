@@ -30,7 +30,7 @@ def folder(
     one_hand_plan, one_hand_rollout, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A run folder `run` of the shortest motion, a scene, a spec and a policy."""
-    from clamber.execution.simulation import judge
+    from clamber.execution.verdict import judge
 
     folder = tmp_path_factory.mktemp("terminal")
     run = folder / "run"

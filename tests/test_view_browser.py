@@ -402,7 +402,7 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
         tab.get_by_role("button", name="Simulate").click()
         tab.wait_for_selector("text=Physics: it did not make it")
         view.show("Stances")  # two hands are not the whole robot on the box
-        row = tab.locator("tr.bad", has_text="share of the weight at the end on obst")
+        row = tab.locator("tr.bad", has_text="load on obstacles at the end")
         row.wait_for()
         assert 0.3 < float(row.locator("td").nth(1).inner_text()) < 0.7
         view.show("Edit")

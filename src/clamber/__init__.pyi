@@ -13,12 +13,12 @@ from clamber.errors import InputError as InputError
 from clamber.errors import MissingDependency as MissingDependency
 from clamber.errors import Status as Status
 from clamber.execution.disturbance import Disturbance as Disturbance
-from clamber.execution.executive import Event as Event
-from clamber.execution.simulation import Criterion as Criterion
+from clamber.execution.events import Event as Event
 from clamber.execution.simulation import Rollout as Rollout
-from clamber.execution.simulation import Verdict as Verdict
-from clamber.execution.simulation import judge as judge
 from clamber.execution.simulation import simulate as simulate
+from clamber.execution.verdict import Criterion as Criterion
+from clamber.execution.verdict import Verdict as Verdict
+from clamber.execution.verdict import judge as judge
 from clamber.model.kinematics import Kinematics as Kinematics
 from clamber.model.kinematics import limb_lengths as limb_lengths
 from clamber.model.propose import Proposal as Proposal

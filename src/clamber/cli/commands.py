@@ -166,7 +166,7 @@ class ExecutionFlags:
             plan,
             controller=self.controller,
             disturbance=self.disturb,
-            truth=None if truth is None else clamber.load_scene(truth),
+            true_scene=None if truth is None else clamber.load_scene(truth),
             progress=report,
         )
         clamber.save_rollout(plan, rollout, folder)

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from rich.progress import (
 from rich.table import Table
 
 import clamber
+from clamber.execution.events import event_fields
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: the robot made it (or the command did its work), it did not, bad
@@ -315,7 +316,7 @@ def conclude(
             n: {"value": c.value, "limit": c.limit, "ok": c.ok}
             for n, c in criteria.items()
         },
-        "events": [] if rollout is None else [asdict(e) for e in rollout.events],
+        "events": [] if rollout is None else [event_fields(e) for e in rollout.events],
         "stopped": "" if rollout is None else rollout.stopped,
         **planned,
     }
@@ -333,7 +334,7 @@ def conclude(
     if rollout is not None and rollout.events:
         felt = new_table("at [s]", "felt on the way")
         for e in rollout.events:
-            felt.add_row(f"{e.time:.2f}", e.text)
+            felt.add_row(f"{e.time:.2f}", str(e))
         tables.append(felt)
     tables += [table] if criteria else []
     output.show(record, *tables, note=closing(note, folder, reached))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,3 +166,8 @@ EVENTS: dict[str, type[Event]] = {
         *(Replanned, NotReplanned, Stopped),
     )
 }
+
+
+def event_fields(event: Event) -> dict[str, Any]:
+    """An event by the keys of `execution.json`: its type, its fields, its sentence."""
+    return {"type": type(event).__name__, **asdict(event), "text": str(event)}

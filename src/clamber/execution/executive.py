@@ -15,15 +15,29 @@ surface; late and noisy. Nothing else of the physics is looked at.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.contact.steps import split_moves
 from clamber.execution.balance import Balance
+from clamber.execution.events import (
+    ContactMoved,
+    Event,
+    Heavier,
+    Lost,
+    Missing,
+    NotReplanned,
+    Replanned,
+    StartsElsewhere,
+    Stopped,
+    Unintended,
+)
 from clamber.execution.leaning import (
     Lean,
     is_leaning,
@@ -76,14 +90,6 @@ WITHDRAWALS = 4  # as often another way is looked for
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
 
 Ticks = Iterator[None]
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Event:
-    """What was felt, and what was done about it."""
-
-    time: float
-    text: str
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -286,7 +292,7 @@ class Execution:
         assert lean is not None
         self._lean = None
         link = m.body(m.geom_bodyid[lean.geom]).name
-        self._note(f"{link} leans on {lean.support}: back, to keep it farther away")
+        self._note(Unintended, link=link, support=lean.support)
         key = lean.geom, lean.support
         self._wary[key] = KEPT_OFF + max(lean.distance, self._wary.get(key, 0.0))
         self._withdrawals += 1
@@ -324,22 +330,19 @@ class Execution:
         after = self._keyframes[self._leg + 1].stance
         stance = [c for c in after if c.surface not in limb.surfaces]
         assert leg.made is not None
-        self._note(f"{made.surface} touches {self._words(made, leg.made)}")
+        self._note_moved(made, leg.made, made=True)
         self._leg += 1
         self._tick_off(leg)
         yield from self._replan((*stance, made), stance)
 
     def _seek(self, c: Contact) -> Ticks:
         """A contact is not found where it was planned: another place for the limb."""
-        missing = (
-            f"{c.surface} finds no support within {1e3 * REACH:.0f} mm of where it was"
-            " planned"
-        )
+        missing = Missing(time=self._time, surface=c.surface, depth=REACH)
         if self._searches == SEARCHES:
-            self._stop(missing)
+            self._stop(str(missing))
             return
         self._searches += 1
-        self._note(missing)
+        self.events.append(missing)
         limb = self._plan.world.robot.limb_of(c.surface)
         stance = self._keyframes[self._leg].stance
         held = [x for x in stance if x.surface not in limb.surfaces]
@@ -350,7 +353,7 @@ class Execution:
         weight = self._weight = float(self._load[:, 2].sum())
         ratio = weight / (9.81 * self._world.mass)
         if abs(ratio - 1.0) > MASS_CHANGE:
-            self._note(f"weighs {100 * ratio:.0f} % of what its description says")
+            self._note(Heavier, factor=ratio)
             self._scale = float(np.clip(ratio, 0.5, 2.0))
         if self._plan.midway is not None:
             yield from self._check_stance()
@@ -365,10 +368,7 @@ class Execution:
         off = away + 0.3 * abs(yaw)
         if off <= START_DRIFT:
             return
-        self._note(
-            f"starts {1e3 * away:.0f} mm and {np.degrees(yaw):.0f} degrees from where"
-            " it was planned"
-        )
+        self._note(StartsElsewhere, distance=away, yaw=yaw)
         scene = replace(self._world.scene, start=np.array([*xy, theta + yaw]))
         found = start_again(self._plan, scene)
         yield from self._rest(THINKING)
@@ -385,10 +385,10 @@ class Execution:
         for c in stance:
             if self._force(c) >= LOST or self._other(c) is not None:
                 continue
-            self._note(f"{c.surface} bears nothing: felt for again")
+            self._note(Lost, surface=c.surface)
             felt = yield from self._feel(c)
             if felt is None:
-                self._note(f"{c.surface} finds nothing: the others bear the robot")
+                self._note(Lost, surface=c.surface, given_up=True)
                 others = [x for x in stance if x is not c]
                 yield from self._replan(others, others)
                 return
@@ -401,7 +401,7 @@ class Execution:
         for c, planned in zip(actual, stance, strict=True):
             up, side = self._off(c)
             if c is not planned or abs(up) > DEVIATION or side > DRIFT:
-                self._note(f"{c.surface} is {self._words(c, planned)}")
+                self._note_moved(c, planned, made=False)
                 yield from self._replan(actual, actual)
                 return
 
@@ -525,7 +525,7 @@ class Execution:
         if found.missed and steps == 0:
             self._stop(found.missed)
             return
-        self._note(f"planned again: {steps} step{'s' * (steps != 1)}")
+        self._note(Replanned, changes=steps)
         self._adopt(
             found.world,
             found.trajectory,
@@ -540,10 +540,10 @@ class Execution:
     def _go_on(self, off: float, why: str) -> Ticks:
         """No other plan was found: the one at hand may do, or may not."""
         if self._steps and self._made == len(self._steps):
-            self._note(f"stays as it is ({why})")
+            self._note(NotReplanned, why=why, stays=True)
             self._leg = len(self._legs)
         elif off < FALLBACK:
-            self._note(f"goes on as planned ({why})")
+            self._note(NotReplanned, why=why, stays=False)
             self._resume()
             if self._leg > 0:
                 yield from self._play(self._legs[self._leg - 1].end)
@@ -552,7 +552,7 @@ class Execution:
 
     def _stop(self, why: str) -> None:
         """Stay in the stance that holds."""
-        self._note(f"stopped: {why}")
+        self._note(Stopped, why=why)
         self.stopped = why
 
     # What it knows.
@@ -573,8 +573,23 @@ class Execution:
         self._missed, self._more = missed, more
         self._return: tuple[np.ndarray, np.ndarray, int] | None = None
 
-    def _note(self, text: str) -> None:
-        self.events.append(Event(time=self._k * PHYSICS_STEP, text=text))
+    @property
+    def _time(self) -> float:
+        return self._k * PHYSICS_STEP
+
+    def _note(self, kind: type[Event], **what: Any) -> None:
+        self.events.append(kind(time=self._time, **what))
+
+    def _note_moved(self, c: Contact, planned: Contact, *, made: bool) -> None:
+        above, aside = self._off(c)
+        self._note(
+            ContactMoved,
+            surface=c.surface,
+            planned=planned.surface,
+            above=above,
+            aside=aside,
+            made=made,
+        )
 
     def _sense(self, m: Measurement) -> None:
         self._load += PHYSICS_STEP / FORCE_SMOOTHING * (m.force - self._load)
@@ -697,17 +712,6 @@ class Execution:
         up = float(off @ n)
         return up, float(np.linalg.norm(off - up * n))
 
-    def _words(self, c: Contact, planned: Contact) -> str:
-        """Where a contact is; `planned` may be of another surface of its limb."""
-        if c.surface != planned.surface:
-            return f"in place of {planned.surface}"
-        up, side = self._off(c)
-        way = "above" if up > 0 else "below"
-        return (
-            f"{1e3 * abs(up):.0f} mm {way}, {1e3 * side:.0f} mm beside where it was"
-            " planned"
-        )
-
     def _as_felt(self, c: Contact) -> Contact:
         """The contact where it is by the sensors."""
         self._kin.update(self._pose)
@@ -801,38 +805,19 @@ def _ankles(world: World) -> dict[str, np.ndarray]:
 
 
 def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
-    """The steps of a trajectory, from its contact flags; its last hold left out."""
+    """The contact changes of a trajectory."""
     out = []
-    last = _arrival(t)
-    ends = [min(t.at(x), last) for x in t.keyframes]
-    for j in range(len(ends) - 1):
-        before = {(c.surface, c.support): c for c in keyframes[j].stance}
-        after = keyframes[j + 1].stance
-        made = [
-            c
-            for c in after
-            if (c.surface, c.support) not in before
-            or np.linalg.norm(before[c.surface, c.support].position - c.position) > 1e-6
-        ]
-        rows = slice(ends[j], ends[j + 1] + 1)
-        if not made:
-            out.append(_Leg(ends[j], ends[j], ends[j + 1], ends[j + 1], None))
+    for j, (before, after) in enumerate(itertools.pairwise(keyframes)):
+        parts = [x for x in t.segments if x.change == j]
+        begin, end = t.at(float(t.keyframes[j])), parts[-1].end - 1
+        making = next((x for x in parts if x.makes is not None), None)
+        if making is None:
+            out.append(_Leg(begin, begin, end, end, None))
             continue
-        c = made[0]
-        open_ = ~t.contact[rows, t.surfaces.index(c.surface)]
-        kept = {x.surface for x in after} - {c.surface}
-        gone = [
-            t.surfaces.index(x.surface)
-            for x in keyframes[j].stance
-            if x.surface not in kept
-        ]
-        air = open_ & ~t.contact[rows][:, gone].any(axis=1)
-        k = np.flatnonzero(air)
-        if len(k) == 0:
-            out.append(_Leg(ends[j], ends[j], ends[j + 1], ends[j + 1], None))
-            continue
-        swing, touch = ends[j] + int(k[0]), ends[j] + int(k[-1])
-        out.append(_Leg(ends[j], swing, touch, ends[j + 1], c))
+        # A limb that is in the air swings from the start.
+        gone = {c.surface for c in before.stance} - {c.surface for c in after.stance}
+        swing = making.begin if gone else begin
+        out.append(_Leg(begin, swing, making.end - 1, end, making.makes))
     return out
 
 

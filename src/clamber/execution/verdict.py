@@ -15,10 +15,10 @@ from clamber.contact.steps import on_feet
 from clamber.execution.simulation import END, Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND
-from clamber.model.se3 import upward, wrapped, yaw_of
+from clamber.model.se3 import upward, wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
-from clamber.step.posture import STANDING_SHARE, standing_share
+from clamber.step.stability import STANDING_SHARE, standing_share
 
 END_SPEED = 0.05  # [m/s] of the pelvis at the end
 TILT_TOL = np.radians(20.0)  # pelvis against the plan at the end
@@ -193,7 +193,9 @@ def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdi
         criteria[Figure.STANDING] = _at_least(stands, STANDING_SHARE)
     if scene.goal is None:
         on_boxes = sum(f.end_load.values()) - on_ground
-        supports = [world.supports[c.support] for c in final if c.support in world.supports]
+        supports = [
+            world.supports[c.support] for c in final if c.support in world.supports
+        ]
         above = min((s.height(last[:3]) for s in supports), default=last[2])
         criteria[Figure.LOAD_ON_OBSTACLES] = _at_least(on_boxes, LOAD_ON_OBSTACLES)
         criteria[Figure.ABOVE_SUPPORT] = _at_least(float(above), ABOVE_SUPPORT)
@@ -201,7 +203,7 @@ def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdi
         away = float(np.linalg.norm(last[:2] - scene.goal[:2]))
         criteria[Figure.GOAL] = _at_most(away, GOAL_TOL)
         if len(scene.goal) == 3:
-            off = abs(wrapped(yaw_of(last[3:7]) - scene.goal[2]))
+            off = float(abs(wrap(yaw_of(last[3:7]) - scene.goal[2])))
             criteria[Figure.YAW] = _at_most(off, float(YAW_TOL))
     return Verdict(reached=all(c.ok for c in criteria.values()), criteria=criteria)
 

@@ -106,17 +106,6 @@ def turn_about_z(yaw: float) -> np.ndarray:
     return np.array([[c, -s], [s, c]])
 
 
-def wrapped(angle: float) -> float:
-    """The same angle in [-pi, pi) [rad]."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
-
-
-def yaw_of(quat: np.ndarray) -> float:
-    """Heading of a unit quaternion (4,) about the vertical [rad]."""
-    w, x, y, z = quat
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-
-
 def upward(quat: np.ndarray) -> np.ndarray:
     """(3,) the turned z axis of a unit quaternion (4,)."""
     w, x, y, z = quat

@@ -139,9 +139,6 @@ class Samples:
         return self._held
 
 
-
-
-
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Segment:
     """A stretch of a trajectory while the same contacts are closed.

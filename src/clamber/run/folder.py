@@ -44,8 +44,9 @@ from clamber.contact.policy import (
 )
 from clamber.contact.steps import Skipped
 from clamber.errors import InputError, Status, input_error, read_yaml, unreadable
-from clamber.execution.executive import Event
-from clamber.execution.simulation import Criterion, Rollout, Verdict
+from clamber.execution.events import EVENTS, Event, event_fields
+from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Criterion, Figure, Verdict
 from clamber.model.kinematics import Kinematics
 from clamber.model.propose import Proposal, robot_yaml
 from clamber.model.robot import LIMBS, ROBOTS, Limb, Robot, RobotFile
@@ -100,7 +101,7 @@ _OF_AN_EARLIER_PLAN = (
     PLANNED_TRAJECTORY,
     REPLANNED,
 )
-_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "stopped", "rests_on"}
+_NOT_IN_ROLLOUT = {"world", "followed", "events", "fell", "rests_on"}
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -1313,8 +1314,7 @@ def _state_of(world: World, path: Path) -> tuple[np.ndarray, dict[str, str] | No
 def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     """Write what physics did, and what it ran.
 
-    `rollout.npz` has the arrays by name (a dictionary of numbers becomes two arrays,
-    the second one `<name>_keys`), `execution.json` what was felt. `scene.xml` and
+    `rollout.npz` has the arrays by name, `execution.json` the events. `scene.xml` and
     `trajectory.npz` become what physics ran and what was last followed; where those are
     not the planned ones, the planned ones are kept as `planned.xml`, `planned.npz`.
     """
@@ -1336,17 +1336,13 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
         value = getattr(rollout, field.name)
         if field.name in _NOT_IN_ROLLOUT or value is None:
             continue
-        if isinstance(value, dict):
-            arrays[field.name] = np.array([*value.values()], dtype=float)
-            arrays[f"{field.name}_keys"] = np.array([*value], dtype=str)
-        else:
-            arrays[field.name] = value
+        arrays[field.name] = value
     _write_npz(folder / ROLLOUT, arrays)
     _write_json(
         folder / EXECUTION,
         {
             "scene": scene_fields(rollout.world.scene),
-            "events": [asdict(e) for e in rollout.events],
+            "events": [event_fields(e) for e in rollout.events],
             "fell": rollout.fell,
             "stopped": rollout.stopped,
             "rests_on": rollout.rests_on,
@@ -1376,6 +1372,10 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
         "actuator_force": (states, nu),
         "contact_force": (states, ns, 3),
         "unintended": (states,),
+        "contact_step": (None,),
+        "contact_geoms": (None, 2),
+        "contact_load": (None, 2),
+        "end_speed": (None,),
     }
     values: dict[str, Any] = {}
     for name, kind in get_type_hints(Rollout).items():
@@ -1385,13 +1385,7 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
             shape = shapes.get(name, (states,))
             values[name] = f.get(name, *shape)
         elif kind is Any or get_args(kind):
-            x = f.get(name, None).tolist()
-            is_dict = get_args(kind)[-1] is float
-            values[name] = (
-                dict(zip(f.get(f"{name}_keys", len(x)).tolist(), x, strict=True))
-                if is_dict
-                else tuple(x)
-            )
+            values[name] = tuple(f.get(name, None).tolist())
         else:
             values[name] = kind(f.get(name).item())
     if "push" in f:
@@ -1427,16 +1421,27 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
         **values,
         world=world,
         followed=followed,
-        events=tuple(Event(time=e.time, text=e.text) for e in file.events),
+        events=tuple(e.event() for e in file.events),
         fell=file.fell,
-        stopped=file.stopped,
         rests_on=tuple(file.rests_on),
     )
 
 
-class _EventFile(pydantic.BaseModel):
+class _EventFile(pydantic.BaseModel, extra="allow"):
+    type: str
     time: float
     text: str
+
+    @pydantic.model_validator(mode="after")
+    def _is_one(self) -> _EventFile:
+        if self.type not in EVENTS:
+            raise ValueError(f"one of {', '.join(EVENTS)}")
+        self.event()
+        return self
+
+    def event(self) -> Event:
+        fields = {"time": self.time, **(self.model_extra or {})}
+        return pydantic.TypeAdapter(EVENTS[self.type]).validate_python(fields)
 
 
 class _ExecutionFile(pydantic.BaseModel):
@@ -1455,7 +1460,7 @@ class _CriterionFile(pydantic.BaseModel):
 
 class _VerdictFile(pydantic.BaseModel):
     reached: bool
-    criteria: dict[str, _CriterionFile]
+    criteria: dict[Figure, _CriterionFile]
 
 
 def save_verdict(verdict: Verdict, folder: str | Path) -> None:

@@ -17,8 +17,10 @@ import pydantic
 
 from clamber.errors import InputError, input_error
 from clamber.execution.disturbance import Disturbance
+from clamber.execution.events import Replanned
 from clamber.execution.servo import ControlMode
-from clamber.execution.simulation import DEFAULT_CONTROLLER, judge, simulate
+from clamber.execution.simulation import DEFAULT_CONTROLLER, simulate
+from clamber.execution.verdict import Figure, judge
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.terrain import load_scene
@@ -30,7 +32,6 @@ from clamber.planning.substitutes import plan_or_replan
 from clamber.recording.detect import detect_contacts
 from clamber.recording.library import load_demo
 
-EFFORT = "largest effort, share of the limit"  # a criterion of the verdict
 Contacts = Literal["any", "demonstrated"]
 
 
@@ -186,8 +187,8 @@ def run_job(job: Job) -> Outcome:
         reached=verdict.reached,
         why="" if verdict.reached else wrong[0],
         seconds=round(len(rollout.ctrl) * PHYSICS_STEP, 6),
-        replans=sum(e.text.startswith("planned again") for e in rollout.events),
-        effort=round(verdict.criteria[EFFORT].value, 6),
+        replans=sum(isinstance(e, Replanned) for e in rollout.events),
+        effort=round(verdict.criteria[Figure.EFFORT].value, 6),
     )
 
 

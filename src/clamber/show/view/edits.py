@@ -15,7 +15,8 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.steps import Step, same_place, split_moves
-from clamber.execution.simulation import Rollout, Verdict
+from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Verdict
 from clamber.model.scene import Support
 from clamber.planning.planner import plan
 from clamber.planning.records import Plan

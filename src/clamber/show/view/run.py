@@ -11,7 +11,8 @@ import numpy as np
 
 from clamber.contact.contact import ContactSequence
 from clamber.errors import ClamberError
-from clamber.execution.simulation import Rollout, Verdict, judge, simulate
+from clamber.execution.simulation import Rollout, simulate
+from clamber.execution.verdict import Verdict, judge
 from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning.records import Plan
