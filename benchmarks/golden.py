@@ -147,8 +147,8 @@ def in_scene(scene: str, case: Callable[[Path], dict[str, Any]]) -> Any:
 
 
 def learned(folder: Path) -> dict[str, Any]:
-    """A policy of two demonstrations."""
-    clamber(folder, "learn", "crossing", "climb", "--out", "policy.json")
+    """A policy of the crossing."""
+    clamber(folder, "learn", "crossing", "--out", "policy.json")
     made = json.loads((folder / "policy.json").read_text())
     return {"policy": digest({k: v for k, v in made.items() if k != "version"})}
 
@@ -162,6 +162,7 @@ def crossed(folder: Path) -> dict[str, Any]:
         " clamber.load_robot('coman'), clamber.load_scene('scene.yaml'))\n"
         "clamber.save_plan(p, 'run')\n"
     )
+    (folder / "run").mkdir()
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
     return read_run(folder / "run")
 
