@@ -3,11 +3,16 @@
 What a description names is looked for and only read; nothing is written. A URDF's
 `package://` meshes are found beside the file and in `ROS_PACKAGE_PATH`; those that
 MuJoCo does not load become part of the spec.
+
+Shapes: N vertices, F triangles.
 """
 
 from __future__ import annotations
 
+import functools
+import io
 import os
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,17 +21,31 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError
-from clamber.model.markup import read_xml
-from clamber.model.mesh_files import COLLADA, MeshFile, read_mesh
+from clamber.errors import InputError, unreadable
+from clamber.model.records import short_repr
 from clamber.model.se3 import matrix_from_quat
 
-MESHES = (".stl", ".obj", ".msh", COLLADA)
+COLLADA, STL = ".dae", ".stl"
+MESHES = (STL, ".obj", ".msh", COLLADA)
 CLEARLY = 0.5  # times as far, and no farther, are joints from what is theirs
 WATER = 1000.0  # [kg/m^3]
 LEAST_INERTIA = 1e-9  # [kg m^2]
 PACKAGE = "package://"
 SEARCH_PATH = "ROS_PACKAGE_PATH"
+MAX_BYTES = 50_000_000  # of a file
+STL_HEAD, STL_FACE = 84, 50  # [byte] of an STL that is not text
+# What a shape does not need; the rest of a COLLADA file need not be in order.
+_BESIDE = (
+    "library_images library_effects library_materials library_cameras library_lights"
+    " library_animations library_controllers bind_material instance_camera"
+    " instance_light extra"
+).split()
+# The way right, in and up of a COLLADA file to x, -y and z.
+_UPRIGHT = {
+    "X_UP": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    "Y_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "Z_UP": np.eye(3),
+}
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -42,6 +61,8 @@ class Description:
     spec: mujoco.MjSpec
     mimics: dict[str, str]
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
 
 def read_description(path: Path, *, lenient: bool = False) -> Description:
@@ -78,13 +99,10 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
                 if e.type == mujoco.mjtEq.mjEQ_JOINT
             }
         else:
-            raise InputError(
-                "an MJCF (mujoco) or URDF (robot) file", source=path, value=root.tag
-            )
+            expected = "an MJCF (mujoco) or URDF (robot) file"
+            raise InputError(expected, path, value=root.tag)
     except ValueError as e:
-        raise InputError(
-            f"a model that MuJoCo loads ({_one_line(e)})", source=path
-        ) from e
+        raise InputError(f"a model that MuJoCo loads ({_one_line(e)})", path) from e
     return Description(spec=spec, mimics=mimics, notes=tuple(notes))
 
 
@@ -97,13 +115,11 @@ def compile_description(description: Description, path: Path) -> mujoco.MjModel:
     try:
         return description.spec.compile()
     except ValueError as e:
-        raise InputError(
-            f"a model that MuJoCo loads ({_one_line(e)})", source=path
-        ) from e
+        raise InputError(f"a model that MuJoCo loads ({_one_line(e)})", path) from e
 
 
 def _one_line(e: Exception) -> str:
-    return " ".join(str(e).split())
+    return " ".join(str(e).split()) or type(e).__name__
 
 
 def _resolve_meshes(
@@ -111,40 +127,30 @@ def _resolve_meshes(
 ) -> None:
     """Put where a mesh is in place of what it is called."""
     for link in root.findall("link"):
-        for kind in ("visual", "collision"):
-            for shape in link.findall(kind):
-                mesh = shape.find("geometry/mesh")
-                if mesh is None:
-                    continue
-                name = mesh.get("filename", "")
-                where = f"link {link.get('name')!r}: {kind} mesh"
-                if Path(name).suffix.lower() not in MESHES:
-                    if not lenient:
-                        raise InputError(
-                            f"one of {', '.join(MESHES)}",
-                            source=path,
-                            field=where,
-                            value=name,
-                        )
-                    link.remove(shape)
-                    notes.append(f"{where} {name} is left out: no known format")
-                    continue
-                found = next((p for p in _places(name, path) if p.is_file()), None)
-                if found is None:
-                    hint = f", or its package below {SEARCH_PATH}"
-                    raise InputError(
-                        "a mesh that is there" + (hint if PACKAGE in name else ""),
-                        source=path,
-                        field=where,
-                        value=name,
-                    )
-                mesh.set("filename", str(found.resolve()))
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            mesh = shape.find("geometry/mesh")
+            if mesh is None:
+                continue
+            name = mesh.get("filename", "")
+            where = f"link {link.get('name')!r}: {shape.tag} mesh"
+            if Path(name).suffix.lower() not in MESHES:
+                if not lenient:
+                    raise InputError(f"one of {', '.join(MESHES)}", path, where, name)
+                link.remove(shape)
+                notes.append(f"{where} {name} is left out: no known format")
+                continue
+            found = next((p for p in _places(name, path) if p.is_file()), None)
+            if found is None:
+                hint = f", or its package below {SEARCH_PATH}"
+                expected = "a mesh that is there" + (hint if PACKAGE in name else "")
+                raise InputError(expected, path, where, name)
+            mesh.set("filename", str(found.resolve()))
 
 
 def _take_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """Put the triangles of files that MuJoCo does not load into the spec."""
-    read = {m.name: read_mesh(Path(m.file)) for m in spec.meshes}
-    found = {n: m for n, m in read.items() if m is not None}
+    files = {m.name: Path(m.file) for m in spec.meshes}
+    found = {n: read_mesh(p) for n, p in files.items() if not _is_for_mujoco(p)}
     upright = _fits_upright(spec, found)
     if upright:
         notes.append(
@@ -189,28 +195,20 @@ def _check_inertia(
         inertial = link.find("inertial")
         if inertial is None:
             continue
+        where = f"link {link.get('name')!r}: inertia"
         try:
             mass = float(inertial.find("mass").get("value"))  # pyright: ignore
             I = {k: float(v) for k, v in inertial.find("inertia").items()}  # pyright: ignore
-            full = [
-                [I["ixx"], I["ixy"], I["ixz"]],
-                [I["ixy"], I["iyy"], I["iyz"]],
-                [I["ixz"], I["iyz"], I["izz"]],
-            ]
+            full = [[I[f"i{min(a, b)}{max(a, b)}"] for b in "xyz"] for a in "xyz"]
         except (AttributeError, KeyError, TypeError, ValueError) as e:
-            raise InputError(
-                "a mass and an inertia in numbers",
-                source=path,
-                field=f"link {link.get('name')!r}: inertial",
-            ) from e
+            raise InputError("a mass and an inertia in numbers", path, where) from e
         if mass > 0 and np.linalg.eigvalsh(np.array(full))[0] > LEAST_INERTIA:
             continue
-        where = f"link {link.get('name')!r}: inertia"
         if mass <= 0:
             link.remove(inertial)
             continue
         if not lenient:
-            raise InputError("a positive inertia", source=path, field=where)
+            raise InputError("a positive inertia", path, where)
         notes.append(f"{where} is not positive: that of a ball as dense as water")
         radius = (3 * mass / (4 * np.pi * WATER)) ** (1 / 3)
         ball = f"{0.4 * mass * radius**2:.6g}"
@@ -251,3 +249,171 @@ def _places(name: str, path: Path) -> Iterator[Path]:
             yield Path(folder) / rest
             if Path(folder).name == rest.partition("/")[0]:
                 yield Path(folder) / inside
+
+
+# Meshes.
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class MeshFile:
+    """What a file holds, in its own axes.
+
+    Attributes:
+        vertices: (N, 3) [m].
+        triangles: (F, 3) indices of vertices.
+        upright: (3, 3) rotation that makes z of the axis that the file calls up; tools
+            differ in whether they heed it.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    upright: np.ndarray
+
+    __repr__ = short_repr
+
+
+def read_mesh(path: Path) -> MeshFile:
+    """The triangles of an STL, OBJ or COLLADA file; nothing that it refers to is read.
+
+    COLLADA is placed by the nodes of its scene, in metres; other files are as they are.
+
+    Raises:
+        InputError: It cannot be read, or is broken or too large.
+    """
+    kind, scale, upright = path.suffix.lower().removeprefix("."), 1.0, np.eye(3)
+    try:
+        if path.suffix.lower() == COLLADA:
+            content, scale, upright = _shapes_of_collada(read_xml(path), path)
+        else:
+            content = _read_content(path)
+            kind = "stl_ascii" if kind == "stl" and _is_text(path) else kind
+        import trimesh  # slow to import, and few need it
+
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            # What is no number would end a list of numbers, with a warning.
+            warnings.filterwarnings("error", message=".*string or file could not be")
+            scene = trimesh.load_scene(
+                io.BytesIO(content),
+                file_type=kind,
+                process=False,
+                ignore_broken=False,
+                skip_materials=True,
+            )
+            corners = scale * np.asarray(scene.to_mesh().triangles)
+    except InputError:
+        raise
+    except Exception as e:  # the libraries raise whatever they trip over
+        raise InputError(f"a {path.suffix} mesh ({_one_line(e)})", path) from e
+    if not np.isfinite(corners).all():
+        raise InputError("a mesh of finite numbers", path)
+    vertices, faces = np.unique(
+        corners.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True
+    )
+    faces = faces.reshape(-1, 3)
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if len(faces) == 0:
+        raise InputError("a mesh with triangles", path)
+    return MeshFile(vertices=vertices.astype(float), triangles=faces, upright=upright)
+
+
+def _is_for_mujoco(path: Path) -> bool:
+    """Whether MuJoCo loads a mesh itself: all but COLLADA, and STL in text."""
+    suffix = path.suffix.lower()
+    return suffix != COLLADA and not (suffix == STL and _is_text(path))
+
+
+def _is_text(path: Path) -> bool:
+    """Whether an STL is text: a binary one may begin with the same word."""
+    content = _read_content(path)
+    faces = int.from_bytes(content[80:STL_HEAD], "little")
+    binary = len(content) == STL_HEAD + STL_FACE * faces
+    return content.lstrip().startswith(b"solid") and not binary
+
+
+def _shapes_of_collada(
+    root: ElementTree.Element, path: Path
+) -> tuple[bytes, float, np.ndarray]:
+    """A COLLADA file without what is no shape, its unit [m], and the turn to z up.
+
+    What the library would read as something else is refused.
+    """
+    unit, up, scene = 1.0, "Y_UP", None
+    for parent in root.iter():
+        for child in list(parent):
+            if _tag(child) in _BESIDE:
+                parent.remove(child)
+        numbers = (parent.text or "").lower()
+        if _tag(parent) == "float_array" and "nan" in numbers:
+            raise InputError("a mesh of finite numbers", path)
+        if _tag(parent) == "p" and "-" in numbers:
+            raise InputError("indices of vertices from 0", path)
+        if _tag(parent) == "unit":
+            unit = float(parent.get("meter", 1.0))
+        elif _tag(parent) == "up_axis":
+            up = numbers.strip().upper()
+        elif _tag(parent) == "scene":
+            scene = parent
+    if scene is None:
+        raise InputError("COLLADA with a scene", path)
+    if not 0 < unit < np.inf:
+        raise InputError("a positive number", path, "<unit meter>", unit)
+    if _written_out(root, scene) > MAX_BYTES:
+        what = f"at most {MAX_BYTES // 1_000_000} MB where its nodes are placed"
+        raise InputError(what, path)
+    return ElementTree.tostring(root), unit, _UPRIGHT[up]
+
+
+def _tag(element: ElementTree.Element) -> str:
+    """Without its namespace."""
+    return element.tag.rpartition("}")[2]
+
+
+def _written_out(root: ElementTree.Element, scene: ElementTree.Element) -> int:
+    """How long a scene is where all that it names stands in place of the name.
+
+    Nodes that name one another can multiply without end.
+    """
+    named = {f"#{e.get('id')}": e for e in root.iter()}
+
+    @functools.cache
+    def size(e: ElementTree.Element) -> int:
+        inside = sum(map(size, e)) + len(e.text or "") + 1
+        url = e.get("url")
+        return inside + size(named[url]) if url in named else inside
+
+    return size(scene)
+
+
+# XML.
+
+
+def _read_content(path: Path) -> bytes:
+    """The bytes of a file that is not too large."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"at most {MAX_BYTES // 1_000_000} MB", path, value=size)
+        return path.read_bytes()
+    except OSError as e:
+        raise unreadable(path, e) from e
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """The root of an XML file in UTF-8 without a document type.
+
+    A document type could hold entities that expand without end or pull in files.
+
+    Raises:
+        InputError: It is no such file, or too large.
+    """
+    content = _read_content(path)
+    if b"\0" in content:  # UTF-16 would hide what is looked for next
+        raise InputError("XML in UTF-8", path)
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        expected = "XML without a document type: entities are not expanded"
+        raise InputError(expected, path, "<!DOCTYPE>")
+    try:
+        return ElementTree.fromstring(content)
+    except (ElementTree.ParseError, LookupError, ValueError) as e:  # or an encoding
+        raise InputError(f"XML ({e})", path) from e
