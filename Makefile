@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-all test-mujoco3 fast lint type bench pictures experiments docs build clean
+.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type bench pictures experiments docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,6 +13,10 @@ WORKERS ?= auto
 # The first Python that is new enough; `make PYTHON=/path/to/python3.12 ...` names another.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && command -v $$p && break; done)
+# Whole files go to one worker, so that what they share is made once.
+PYTEST = -m pytest -n $(WORKERS) --dist loadfile
+OUTSIDE = docs or pool or browser
+QUICK = not slow and not gpu and not network
 # One thread for each process: the matrices are small, and tests run side by side.
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
@@ -23,23 +27,25 @@ help: ## show this
 demo: $(VENV)/.has-video ## climb a box: plan, physics, pictures and video, into runs/climb
 	@$(BIN)/clamber climb --video
 
-test: $(VENV)/.has-video $(VENV)/.has-test ## every test but the slow ones
-	$(BIN)/python -m pytest -m "not slow and not gpu and not network" -n $(WORKERS) --dist loadfile
+test: $(VENV)/.has-video $(VENV)/.has-test ## every test but the slow ones and those of test-ci
+	$(BIN)/python $(PYTEST) -m "$(QUICK) and not ($(OUTSIDE))"
+
+test-ci: $(VENV)/.has-video $(VENV)/.has-test ## what starts other programs: docs' blocks, process pools, browsers
+	$(BIN)/python $(PYTEST) -m "$(QUICK) and ($(OUTSIDE))"
 
 test-all: $(VENV)/.has-video $(VENV)/.has-test ## the slow tests too: whole climbs in physics
-	$(BIN)/python -m pytest -m "not gpu and not network" -n $(WORKERS) --dist loadfile
+	$(BIN)/python $(PYTEST) -m "not gpu and not network"
 
 test-mujoco3: | $(BIN)/python ## the tests of `make test` with the last MuJoCo 3, in an environment of their own
 	@[ -x $(VENV3)/bin/python ] || $(BIN)/python -m venv $(VENV3)
 	@grep -v '^mujoco' constraints.txt > $(VENV3)/constraints.txt
 	@$(VENV3)/bin/python -m pip install --quiet --disable-pip-version-check \
 		-c $(VENV3)/constraints.txt 'mujoco<4' -e '.[video,test]'
-	$(VENV3)/bin/python -m pytest -m "not slow and not gpu and not network and not compare" -n $(WORKERS) --dist loadfile
+	$(VENV3)/bin/python $(PYTEST) -m "$(QUICK) and not ($(OUTSIDE)) and not compare"
 
-fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then what failed last, stops at the first failure
+fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then tests without a whole plan; what failed last comes first
 	@$(BIN)/ruff check --quiet .
-	$(BIN)/python -m pytest -q -x --last-failed --last-failed-no-failures all \
-		-m "not slow and not gpu and not network and not compare"
+	$(BIN)/python $(PYTEST) -q -x --failed-first -m "$(QUICK) and not ($(OUTSIDE)) and not compare and not whole"
 
 lint: $(VENV)/.has-dev ## ruff: rules and format
 	$(BIN)/ruff check .

@@ -81,6 +81,23 @@ def shared() -> Path:
     return folder
 
 
+# What takes seconds to make: `make fast` leaves out who asks for it.
+WHOLE = {
+    *("demo_plan", "fast_plan", "hands_plan", "demo_rollout", "demo_kinematics"),
+    *("one_hand_plan", "one_hand_rollout"),
+}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests by what they ask for: a whole plan or run, a browser."""
+    for item in items:
+        names = set(getattr(item, "fixturenames", ()))
+        if names & WHOLE:
+            item.add_marker("whole")
+        if "browser" in names:
+            item.add_marker("browser")
+
+
 # The demonstration planned and simulated once for all tests that look at the result.
 DEMO_HEIGHT = 0.275  # [m] the box of the method's own experiments
 

@@ -360,6 +360,7 @@ def ids(page: Path) -> str:
     return page.stem
 
 
+@pytest.mark.docs
 @pytest.mark.parametrize("page", PAGES, ids=ids)
 def test_the_blocks_of_a_page_do_what_they_say(page: Path, tmp_path: Path, climb: Path):
     play(page, tmp_path, climb, slow=False)

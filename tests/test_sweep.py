@@ -24,6 +24,7 @@ from clamber.study.climb import Outcome
 from clamber.study.spec import Spec, load_spec
 from clamber.study.sweep import CRASHED, load_sweep, read_outcomes, run_sweep
 
+pytestmark = pytest.mark.pool
 SEARCH = """
 base: {height: 0.275}
 search: {factor: disturb.friction, from: 1.0, to: 0.05, runs: 20}
