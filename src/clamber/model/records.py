@@ -30,18 +30,18 @@ def frozen_array(x: ArrayLike, shape: tuple[int, ...] | None = None) -> np.ndarr
     return out
 
 
-def short_repr(record: Any) -> str:
+def short_repr(self: Any) -> str:
     """A record in one short line: of large fields the shape, of records the name.
 
     In the body of a dataclass, `__repr__ = short_repr`.
     """
     parts = [
-        f"{f.name}={_brief(getattr(record, f.name))}" for f in fields(record) if f.repr
+        f"{f.name}={_brief(getattr(self, f.name))}" for f in fields(self) if f.repr
     ]
     text = ", ".join(parts)
     if len(text) > _LONGEST:
         text = text[:_LONGEST].rpartition(", ")[0] + ", ..."
-    return f"{type(record).__name__}({text})"
+    return f"{type(self).__name__}({text})"
 
 
 def _brief(value: object) -> str:

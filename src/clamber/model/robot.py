@@ -134,33 +134,23 @@ def load_robot(name_or_path: str | Path) -> Robot:
     Raises:
         InputError: No such robot, or a field of its file cannot be used.
     """
-    path = Path(name_or_path)
+    path, given = Path(name_or_path), str(name_or_path)
     if not path.suffix:
         known = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))
-        if str(name_or_path) not in known:
-            raise InputError(
-                f"a robot.yaml, or one of {', '.join(known)}",
-                source="--robot",
-                value=str(name_or_path),
-            )
-        path = ROBOTS / str(name_or_path) / "robot.yaml"
+        if given not in known:
+            expected = f"a robot.yaml, or one of {', '.join(known)}"
+            raise InputError(expected, "--robot", value=given)
+        path = ROBOTS / given / "robot.yaml"
     elif path.suffix not in (".yaml", ".yml"):
-        raise InputError(
-            "a robot.yaml beside the model, which names its limbs and surfaces",
-            source="--robot",
-            value=str(path),
-        )
+        expected = "a robot.yaml beside the model, which names its limbs and surfaces"
+        raise InputError(expected, "--robot", value=given)
     file = validated(RobotFile, read_yaml(path), path)
     missing = set(LIMBS) - set(file.limbs)
     if missing:
-        raise InputError(
-            "all four limbs", source=path, field="limbs", value=sorted(missing)
-        )
+        raise InputError("all four limbs", path, "limbs", sorted(missing))
     model_path = path.parent / file.model
     if not model_path.is_file():
-        raise InputError(
-            "an MJCF or URDF file", source=path, field="model", value=file.model
-        )
+        raise InputError("an MJCF or URDF file", path, "model", file.model)
     limbs = {
         n: Limb(
             name=n, root=f.root, middle=f.middle, end=f.end, surfaces=tuple(f.surfaces)
@@ -190,17 +180,12 @@ def load_robot(name_or_path: str | Path) -> Robot:
 def _check(robot: Robot, source: Path) -> None:
     """Compile the robot alone and look up every name that its file mentions."""
     description = read_description(robot.path)
-    model = compile_description(description, robot.path)
+    model, file = compile_description(description, robot.path), robot.path.name
     bodies = {model.body(i).name for i in range(model.nbody)}
     geoms = {model.geom(i).name for i in range(model.ngeom)}
     joints = {model.joint(i).name for i in range(model.njnt)}
     if robot.base not in bodies:
-        raise InputError(
-            f"a body of {robot.path.name}",
-            source=source,
-            field="base",
-            value=robot.base,
-        )
+        raise InputError(f"a body of {file}", source, "base", robot.base)
     named = {
         "home": robot.home,
         "effort": robot.effort,
@@ -209,33 +194,23 @@ def _check(robot: Robot, source: Path) -> None:
         "self_positioning": robot.self_positioning,
     }
     for where, names in named.items():
-        for name in names:
-            if name not in joints:
-                raise InputError(
-                    f"a joint of {robot.path.name}",
-                    source=source,
-                    field=where,
-                    value=name,
-                )
+        if unknown := [n for n in names if n not in joints]:
+            raise InputError(f"a joint of {file}", source, where, unknown[0])
     _check_joints(robot, model, description, source)
     for limb in robot.limbs.values():
+        where = f"limbs.{limb.name}"
         for place in ("root", "middle", "end"):
-            if getattr(limb, place) not in bodies | geoms | set(robot.surfaces):
-                raise InputError(
-                    f"a body or geom of {robot.path.name}",
-                    source=source,
-                    field=f"limbs.{limb.name}.{place}",
-                    value=getattr(limb, place),
-                )
+            value = getattr(limb, place)
+            if value not in bodies | geoms | set(robot.surfaces):
+                expected = f"a body or geom of {file}"
+                raise InputError(expected, source, f"{where}.{place}", value)
         for s in limb.surfaces:
-            if not any(has_prefix(g, robot.prefixes[s]) for g in geoms):
-                raise InputError(
-                    f"a surface that geoms of {robot.path.name} bear by the prefix"
-                    f" {robot.prefixes[s]!r}",
-                    source=source,
-                    field=f"limbs.{limb.name}.surfaces",
-                    value=s,
+            prefix = robot.prefixes[s]
+            if not any(has_prefix(g, prefix) for g in geoms):
+                expected = (
+                    f"a surface that geoms of {file} bear by the prefix {prefix!r}"
                 )
+                raise InputError(expected, source, f"{where}.surfaces", s)
 
 
 def _check_joints(
@@ -245,36 +220,27 @@ def _check_joints(
     kinds = mujoco.mjtJoint
     for j in range(model.njnt):
         name, kind = model.joint(j).name, kinds(int(model.jnt_type[j]))
+        where = f"joint {name!r}"
         if kind == kinds.mjJNT_FREE:
             owner = model.body(int(model.jnt_bodyid[j])).name
             if owner != robot.base:
-                raise InputError(
-                    f"the body that floats, {owner}",
-                    source=source,
-                    field="base",
-                    value=robot.base,
-                )
+                expected = f"the body that floats, {owner}"
+                raise InputError(expected, source, "base", robot.base)
             continue
         if kind != kinds.mjJNT_HINGE:
-            raise InputError(
-                "hinges alone; lock other joints by leaving them out",
-                source=robot.path,
-                field=f"joint {name!r}",
-                value=kind.name.removeprefix("mjJNT_").lower(),
-            )
+            expected = "hinges alone; lock other joints by leaving them out"
+            what = kind.name.removeprefix("mjJNT_").lower()
+            raise InputError(expected, robot.path, where, what)
         if name in description.mimics:
-            raise InputError(
-                "joints that move on their own (it follows"
-                f" {description.mimics[name]!r}): leave it out",
-                source=robot.path,
-                field=f"joint {name!r}",
-            )
+            other = description.mimics[name]
+            expected = f"joints that move on their own (it follows {other!r}):"
+            raise InputError(f"{expected} leave it out", robot.path, where)
         if name not in robot.effort and not np.any(model.jnt_actfrcrange[j]):
             raise InputError(
                 "its largest torque [N m]: the description has none"
                 " (actuatorfrcrange, or a URDF's effort)",
-                source=source,
-                field=f"effort.{name}",
+                source,
+                f"effort.{name}",
             )
 
 
