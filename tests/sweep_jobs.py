@@ -7,22 +7,24 @@ import os
 import time
 from pathlib import Path
 
-from clamber.study.climb import Job, Outcome, command_of
+from clamber.study.climb import Climb, ClimbResult, command_of
 
 LOG = "CLAMBER_TEST_LOG"  # names a folder: each job that begins leaves a file in it
 SECONDS = "CLAMBER_TEST_SECONDS"
 
 
-def breaks_at_friction(job: Job) -> Outcome:
+def breaks_at_friction(job: Climb) -> ClimbResult:
     """Reached above a friction of 0.4, and by chance of its seed around it."""
     mu = job.disturb.friction
     assert mu is not None
     noise = hashlib.sha256(str(job.disturb.seed).encode()).digest()[0] / 255.0 - 0.5
     reached = mu + 0.1 * noise > (0.4 if job.controller == "pid" else 0.3)
-    return Outcome(reached=reached, why="" if reached else "fell", seconds=10.0 * mu)
+    return ClimbResult(
+        reached=reached, why="" if reached else "fell", seconds=10.0 * mu
+    )
 
 
-def slow(job: Job) -> Outcome:
+def slow(job: Climb) -> ClimbResult:
     """The same, noted with its process where it begins."""
     if LOG in os.environ:
         digest = hashlib.sha256(command_of(job).encode()).hexdigest()[:12]
@@ -32,13 +34,13 @@ def slow(job: Job) -> Outcome:
     return breaks_at_friction(job)
 
 
-def crashes_once_in_a_while(job: Job) -> Outcome:
+def crashes_once_in_a_while(job: Climb) -> ClimbResult:
     if job.disturb.seed % 5 == 3:
         raise ZeroDivisionError("no such luck")
     return breaks_at_friction(job)
 
 
-def dies_on_its_first_try(job: Job) -> Outcome:
+def dies_on_its_first_try(job: Climb) -> ClimbResult:
     """The worker process is gone, as when memory runs out, the first time only."""
     mark = Path(os.environ[LOG]) / f"died-{job.disturb.seed}"
     if job.disturb.seed == 4 and not mark.exists():
@@ -47,5 +49,5 @@ def dies_on_its_first_try(job: Job) -> Outcome:
     return breaks_at_friction(job)
 
 
-def always_dies(job: Job) -> Outcome:
+def always_dies(job: Climb) -> ClimbResult:
     os._exit(9)

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from clamber.study.climb import Outcome
+from clamber.study.climb import ClimbResult
 from clamber.study.curves import (
     BIN_RUNS,
     MAX_BINS,
@@ -39,11 +39,11 @@ def swept(content: dict, reached: Callable[[Run], bool]) -> tuple[Spec, Rows]:
     rows: Rows = []
     for strand in strands(spec):
         known: list[Run] = []
-        done: dict[str, Outcome] = {}
+        done: dict[str, ClimbResult] = {}
         while len(done) < strand.runs:
             known += next_runs(spec, strand, known, done)
             for run in known[len(done) :]:
-                done[run.name] = Outcome(reached=reached(run))
+                done[run.name] = ClimbResult(reached=reached(run))
         rows += [(run, done[run.name]) for run in known]
     return spec, rows
 
@@ -118,7 +118,7 @@ def test_the_half_point_of_a_log_scale_is_a_value_of_the_factor():
 def test_crashed_runs_are_counted_apart():
     spec, rows = swept(friction(runs=8), lambda run: True)
     run, _ = rows[3]
-    rows[3] = (run, Outcome(reached=False, why=f"{CRASHED}ValueError: x"))
+    rows[3] = (run, ClimbResult(reached=False, why=f"{CRASHED}ValueError: x"))
     assert [s.errors for s in summarise(spec, rows)] == [1, 0]
     assert [s.reached for s in summarise(spec, rows)] == [7, 8]
 

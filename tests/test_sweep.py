@@ -20,7 +20,7 @@ import pytest
 
 import sweep_jobs
 from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.study.climb import Outcome
+from clamber.study.climb import ClimbResult
 from clamber.study.spec import Spec, load_spec
 from clamber.study.sweep import CRASHED, load_sweep, read_outcomes, run_sweep
 
@@ -446,4 +446,4 @@ def test_an_outcome_survives_the_table(spec: Spec, tmp_path: Path):
     )
     kept = load_sweep(tmp_path / "out")[1]
     assert [o for _, o in kept] == [o for _, o in rows]
-    assert all(isinstance(o, Outcome) for _, o in kept)
+    assert all(isinstance(o, ClimbResult) for _, o in kept)

@@ -75,9 +75,9 @@ from clamber.show.pictures import render_run as render_run
 from clamber.show.report import Reported as Reported
 from clamber.show.report import write_report as write_report
 from clamber.show.view import open_view as open_view
-from clamber.study.climb import Job as Job
-from clamber.study.climb import Outcome as Outcome
-from clamber.study.climb import run_job as run_job
+from clamber.study.climb import Climb as Climb
+from clamber.study.climb import ClimbResult as ClimbResult
+from clamber.study.climb import run_climb as run_climb
 from clamber.study.curves import save_curves as save_curves
 from clamber.study.spec import Spec as Spec
 from clamber.study.spec import load_spec as load_spec

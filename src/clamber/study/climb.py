@@ -1,7 +1,7 @@
-"""job -> outcome: one whole climb, from the recording to the verdict of physics.
+"""One whole climb, from the recording to the verdict of physics.
 
-A job is the flags of `clamber climb`, by the same names, and nothing else: whatever a
-job did can be done again from the command line.
+A `Climb` is the flags of `clamber climb`, by the same names, and nothing else: whatever
+a climb did can be done again from the command line.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import pydantic
 
+from clamber.contact.contact import ContactSequence
 from clamber.errors import InputError, input_error
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Replanned
@@ -36,7 +37,7 @@ Contacts = Literal["any", "demonstrated"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
+class Climb:
     """The flags of one climb.
 
     Attributes:
@@ -75,8 +76,8 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
-    """What became of a job.
+class ClimbResult:
+    """What became of a climb.
 
     Attributes:
         reached: The verdict.
@@ -93,15 +94,15 @@ class Outcome:
     effort: float = 0.0
 
 
-_JOB: pydantic.TypeAdapter[Job] = pydantic.TypeAdapter(Job)
+_CLIMB: pydantic.TypeAdapter[Climb] = pydantic.TypeAdapter(Climb)
 GROUPS = {"search": Bounds, "disturb": Disturbance}  # flags such as `disturb.mass`
-FLAGS = tuple(f.name for f in fields(Job) if f.name not in GROUPS) + tuple(
+FLAGS = tuple(f.name for f in fields(Climb) if f.name not in GROUPS) + tuple(
     f"{group}.{f.name}" for group, kind in GROUPS.items() for f in fields(kind)
 )
 
 
-def job_of(flags: Mapping[str, Any]) -> Job:
-    """The job of flags by name, such as `{"height": 0.275, "disturb.mass": 1.1}`.
+def climb_of(flags: Mapping[str, Any]) -> Climb:
+    """The climb of flags by name, such as `{"height": 0.275, "disturb.mass": 1.1}`.
 
     Raises:
         InputError: There is no such flag, or its value cannot be used.
@@ -114,17 +115,17 @@ def job_of(flags: Mapping[str, Any]) -> Job:
         group, _, own = name.rpartition(".")
         (tree[group] if group else tree)[own] = value
     try:
-        return _JOB.validate_python(tree)
+        return _CLIMB.validate_python(tree)
     except pydantic.ValidationError as e:
         raise input_error(e, None) from e
 
 
-def command_of(job: Job) -> str:
-    """The line that does the job again: robot, scene, controller, and what differs."""
+def command_of(climb: Climb) -> str:
+    """The line that does it again: robot, scene, controller, and what differs."""
     words = ["clamber", "climb"]
     for name in FLAGS:
         group, _, own = name.rpartition(".")
-        home = getattr(job, group) if group else job
+        home = getattr(climb, group) if group else climb
         value = getattr(home, own)
         default = {
             f.name: f.default_factory() if callable(f.default_factory) else f.default
@@ -153,37 +154,29 @@ def scene_of(height: float | None, path: str | Path | None) -> Scene:
         raise InputError(e.expected, "--height", value=height) from e
 
 
-def run_job(job: Job) -> Outcome:
+def run_climb(climb: Climb) -> ClimbResult:
     """Detect, plan, simulate, judge.
 
-    A scene out of the robot's reach and a plan that misses a step are outcomes: the
+    A scene out of the robot's reach and a plan that misses a step are results: the
     robot does not get there. An incomplete plan is not simulated.
     """
     try:
-        made = _planned(
-            job.demo,
-            job.robot,
-            job.height,
-            job.scene,
-            job.method,
-            job.speed,
-            job.contacts,
-            job.search,
-        )
+        # One process does many climbs that differ in their disturbances alone.
+        made = _planned(replace(climb, controller="mixed", disturb=Disturbance()))
         if not made.complete or made.trajectory is None:
             missed = [s.reason for s in made.skipped if s.missed]
             reasons = missed or [s.reason for s in made.skipped] or ["no move in it"]
-            return Outcome(reached=False, why=f"no plan: {reasons[0]}")
-        rollout = simulate(made, controller=job.controller, disturbance=job.disturb)
+            return ClimbResult(reached=False, why=f"no plan: {reasons[0]}")
+        rollout = simulate(made, controller=climb.controller, disturbance=climb.disturb)
     except InputError as e:
-        return Outcome(reached=False, why=f"no plan: {e}")
+        return ClimbResult(reached=False, why=f"no plan: {e}")
     verdict = judge(made, rollout)
     wrong = [name for name, c in verdict.criteria.items() if not c.ok]
     if rollout.fell:
         wrong.insert(0, "fell")
     elif rollout.stopped:
         wrong.insert(0, f"stopped: {rollout.stopped}")
-    return Outcome(
+    return ClimbResult(
         reached=verdict.reached,
         why="" if verdict.reached else wrong[0],
         seconds=round(len(rollout.ctrl) * PHYSICS_STEP, 6),
@@ -193,24 +186,15 @@ def run_job(job: Job) -> Outcome:
 
 
 @functools.lru_cache(maxsize=2)
-def _detected(demo: str) -> Any:
+def _detected(demo: str) -> ContactSequence:
     return detect_contacts(load_demo(demo))
 
 
 @functools.lru_cache(maxsize=4)
-def _planned(
-    demo: str,
-    robot: str,
-    height: float | None,
-    scene: str | None,
-    method: Method,
-    speed: float | Literal["max"],
-    contacts: Contacts,
-    search: Bounds,
-) -> Plan:
-    """One process does many jobs that differ in their disturbances alone."""
-    world = (_detected(demo), load_robot(robot), scene_of(height, scene))
-    options = PlanOptions(method=method, speed=speed)
-    if contacts == "demonstrated":
+def _planned(climb: Climb) -> Plan:
+    robot, scene = load_robot(climb.robot), scene_of(climb.height, climb.scene)
+    world = (_detected(climb.demo), robot, scene)
+    options = PlanOptions(method=climb.method, speed=climb.speed)
+    if climb.contacts == "demonstrated":
         return plan(*world, options=options)
-    return plan_or_replan(*world, options=options, bounds=search)
+    return plan_or_replan(*world, options=options, bounds=climb.search)

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 
 from clamber.run.folder import whole_file
 from clamber.show.plots import finish_axes, save_plot
-from clamber.study.climb import Outcome
+from clamber.study.climb import ClimbResult
 from clamber.study.spec import Spec, Strand, strands
 from clamber.study.statistics import Break, fit_break, wilson
 from clamber.study.sweep import CRASHED, Rows
@@ -29,6 +29,7 @@ CURVE = "curve.csv"
 PICTURE = "success.png"
 BIN_RUNS = 6  # at least, in a bin that holds more than one value
 MAX_BINS = 8
+Cases = list[tuple[Any, ClimbResult]]  # values of a factor, and what became of it
 COLOURS = {"pid": "#b91c1c", "mixed": "#1d4ed8"}
 MARKERS = {"pid": "s", "mixed": "o"}
 UNITS = {
@@ -219,7 +220,7 @@ def _summary(spec: Spec, strand: Strand, rows: Rows) -> Summary:
     )
 
 
-def _parts(found: Sequence[tuple[Any, Outcome]]) -> list[list[tuple[Any, Outcome]]]:
+def _parts(found: Cases) -> list[Cases]:
     """Neighbouring values together."""
     if any(isinstance(v, str) for v, _ in found):
         found = [(str(v), o) for v, o in found]
@@ -232,7 +233,7 @@ def _parts(found: Sequence[tuple[Any, Outcome]]) -> list[list[tuple[Any, Outcome
     return [ordered[a:b] for a, b in itertools.pairwise(edges)]
 
 
-def _bin(controller: str, factor: str, part: list[tuple[Any, Outcome]]) -> Bin:
+def _bin(controller: str, factor: str, part: Cases) -> Bin:
     n, k = len(part), sum(o.reached for _, o in part)
     low, high = wilson(k, n)
     values = [v for v, _ in part]

@@ -20,7 +20,7 @@ import pydantic
 
 from clamber.errors import InputError, input_error, read_yaml
 from clamber.execution.servo import ControlMode
-from clamber.study.climb import FLAGS, Job, Outcome, job_of
+from clamber.study.climb import FLAGS, Climb, ClimbResult, climb_of
 
 SEED = "disturb.seed"
 PATHS = ("demo", "robot", "scene")  # flags that may name a file
@@ -280,7 +280,7 @@ class Run:
     strand: Strand
     share: float | None
     factors: dict[str, Any]
-    job: Job
+    job: Climb
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -345,7 +345,7 @@ def strands(spec: Spec) -> list[Strand]:
 
 
 def next_runs(
-    spec: Spec, strand: Strand, known: Sequence[Run], done: Mapping[str, Outcome]
+    spec: Spec, strand: Strand, known: Sequence[Run], done: Mapping[str, ClimbResult]
 ) -> list[Run]:
     """The runs of a strand that can be chosen now, beyond those known.
 
@@ -445,7 +445,7 @@ def _run(
         strand=strand,
         share=share,
         factors={n: v for n, v in factors.items() if n != SEED},
-        job=job_of(named),
+        job=climb_of(named),
     )
 
 

@@ -5,17 +5,15 @@ Levels run from the easy end of a factor, u = 0, to the hard one, u = 1.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import optimize, special
+from scipy import optimize, special, stats
 
 CONFIDENCE = 0.95
-Z = 1.959963984540054  # two-sided 95 % of the normal distribution
-CHI2 = Z**2  # ... of chi square with one degree of freedom
+CHI2 = float(stats.chi2.ppf(CONFIDENCE, 1))  # one degree of freedom
 SLOPES = np.geomspace(0.5, 400.0, 160)  # steeper ones cannot be told from a step
 REACH = 0.5  # the half point is sought this far beyond both ends
 
@@ -27,11 +25,8 @@ def wilson(successes: int, runs: int) -> tuple[float, float]:
     """
     if runs == 0:
         return 0.0, 1.0
-    p, n = successes / runs, runs
-    middle = (p + Z**2 / (2 * n)) / (1 + Z**2 / n)
-    half = Z / (1 + Z**2 / n) * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
-    low = 0.0 if successes == 0 else middle - half
-    return low, 1.0 if successes == runs else middle + half
+    found = stats.binomtest(successes, runs).proportion_ci(CONFIDENCE, method="wilson")
+    return float(found.low), float(found.high)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

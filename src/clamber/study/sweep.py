@@ -29,7 +29,7 @@ from clamber.model.robot import load_robot
 from clamber.model.terrain import load_scene
 from clamber.recording.library import load_demo
 from clamber.run.folder import whole_file
-from clamber.study.climb import Outcome, command_of, run_job
+from clamber.study.climb import ClimbResult, command_of, run_climb
 from clamber.study.spec import Run, Spec, Strand, goes_on, load_spec, next_runs, strands
 
 SPEC = "spec.yaml"
@@ -41,9 +41,9 @@ LOSSES = 3  # workers lost in a row without one row gained end a sweep
 CONNECT = 10.0  # [s] in which a scheduler has to answer
 CRASHED = "error: "  # begins `why` where a job raised what it never should
 
-JobFunction = Callable[[Any], Outcome]
+JobFunction = Callable[[Any], ClimbResult]
 Progress = Callable[[str, float, str], None]
-Rows = list[tuple[Run, Outcome]]
+Rows = list[tuple[Run, ClimbResult]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +88,7 @@ def run_sweep(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
-    job: JobFunction = run_job,
+    job: JobFunction = run_climb,
     progress: Progress | None = None,
 ) -> tuple[Rows, Pace]:
     """Do all runs of a spec that the folder does not hold yet.
@@ -170,13 +170,13 @@ def check_inputs(spec: Spec) -> None:
 class _Todo:
     """Which runs are known, done and waiting."""
 
-    def __init__(self, spec: Spec, done: Mapping[str, Outcome]) -> None:
+    def __init__(self, spec: Spec, done: Mapping[str, ClimbResult]) -> None:
         self._spec = spec
         self._known: dict[str, list[Run]] = {}
         self._strands = strands(spec)
         self.total = sum(s.runs for s in self._strands)
         self._earlier = dict(done)
-        self.rows: dict[str, Outcome] = {}
+        self.rows: dict[str, ClimbResult] = {}
         self.waiting: dict[str, Run] = {}
         for s in self._strands:
             self._known[s.name] = []
@@ -189,7 +189,7 @@ class _Todo:
                 value=next(iter(self._earlier)),
             )
 
-    def end(self, run: Run, outcome: Outcome) -> list[Run]:
+    def end(self, run: Run, outcome: ClimbResult) -> list[Run]:
         """Note what became of a run; the runs that follow from that."""
         del self.waiting[run.name]
         self.rows[run.name] = outcome
@@ -224,9 +224,9 @@ class _Cost:
 
 def _outcomes(
     executor: Executor, count: int, todo: _Todo, job: JobFunction
-) -> Iterator[tuple[Run, Outcome, _Cost]]:
+) -> Iterator[tuple[Run, ClimbResult, _Cost]]:
     """Submit what can be run, yield what has ended, until nothing waits."""
-    running: dict[Future[tuple[Outcome, _Cost]], Run] = {}
+    running: dict[Future[tuple[ClimbResult, _Cost]], Run] = {}
     ahead = list(todo.waiting.values())
     while ahead or running:
         # Each worker has one in hand and one to go on with: all else can be called off.
@@ -250,13 +250,13 @@ def _outcomes(
             yield run, outcome, cost
 
 
-def _timed(job: JobFunction, what: Any) -> tuple[Outcome, _Cost]:
+def _timed(job: JobFunction, what: Any) -> tuple[ClimbResult, _Cost]:
     """In a worker: the outcome and its cost. A crash is an outcome too."""
     began, before = time.perf_counter(), time.process_time()
     try:
         outcome = job(what)
     except Exception as e:  # days of runs are not lost for one
-        outcome = Outcome(reached=False, why=f"{CRASHED}{type(e).__name__}: {e}")
+        outcome = ClimbResult(reached=False, why=f"{CRASHED}{type(e).__name__}: {e}")
     cost = _Cost(taken=time.perf_counter() - began, busy=time.process_time() - before)
     return outcome, cost
 
@@ -339,11 +339,11 @@ def _begin_worker(coordinator: int) -> None:
 
 def columns(spec: Spec) -> list[str]:
     """Of `runs.csv`."""
-    found = [f.name for f in fields(Outcome)]
+    found = [f.name for f in fields(ClimbResult)]
     return ["run", "controller", *spec.factors, "seed", *found, "command"]
 
 
-def cells(spec: Spec, run: Run, outcome: Outcome) -> list[str]:
+def cells(spec: Spec, run: Run, outcome: ClimbResult) -> list[str]:
     """A row of `runs.csv`; a flag that the run does not set is left empty."""
     found = [_text(v) for v in asdict(outcome).values()]
     factors = [_text(run.factors.get(n, "")) for n in spec.factors]
@@ -371,7 +371,7 @@ class _Table:
         self._spec, self._path, self._stream = spec, path, stream
         self.done = self._read()
 
-    def add(self, run: Run, outcome: Outcome) -> None:
+    def add(self, run: Run, outcome: ClimbResult) -> None:
         """Append a row; it is on disk when this returns."""
         self._stream.write(_line(cells(self._spec, run, outcome)))
         self._flush()
@@ -388,7 +388,7 @@ class _Table:
         self._stream.flush()
         os.fsync(self._stream.fileno())
 
-    def _read(self) -> dict[str, Outcome]:
+    def _read(self) -> dict[str, ClimbResult]:
         """Outcomes by run; a last line that was torn is cut off."""
         content = self._stream.read()
         whole = content[: content.rfind(b"\n") + 1]
@@ -401,7 +401,7 @@ class _Table:
         return read_outcomes(self._spec, whole.decode(), self._path)
 
 
-def read_outcomes(spec: Spec, text: str, source: Path) -> dict[str, Outcome]:
+def read_outcomes(spec: Spec, text: str, source: Path) -> dict[str, ClimbResult]:
     """Outcomes by the names of runs.
 
     Raises:
@@ -418,7 +418,7 @@ def read_outcomes(spec: Spec, text: str, source: Path) -> dict[str, Outcome]:
             row = dict(zip(header, words, strict=True))
             if row["reached"] not in ("yes", "no") or row["run"] in out:
                 raise ValueError(row["run"])
-            out[row["run"]] = Outcome(
+            out[row["run"]] = ClimbResult(
                 reached=row["reached"] == "yes",
                 why=row["why"],
                 seconds=float(row["seconds"]),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError
-from clamber.study.climb import Outcome
+from clamber.study.climb import ClimbResult
 from clamber.study.spec import (
     COARSE,
     LAG,
@@ -37,11 +37,11 @@ def all_runs(spec: Spec, reached: Callable[[Run], bool]) -> list[Run]:
     out: list[Run] = []
     for strand in strands(spec):
         known: list[Run] = []
-        done: dict[str, Outcome] = {}
+        done: dict[str, ClimbResult] = {}
         while len(done) < strand.runs:
             known += next_runs(spec, strand, known, done)
             run = known[len(done)]
-            done[run.name] = Outcome(reached=reached(run))
+            done[run.name] = ClimbResult(reached=reached(run))
         assert next_runs(spec, strand, known, done) == []
         out += known
     return out
@@ -182,14 +182,16 @@ def test_what_a_search_does_next_does_not_depend_on_the_last_runs_under_way():
     spec = search()
     strand = strands(spec)[0]
     known = next_runs(spec, strand, [], {})
-    done = {r.name: Outcome(reached=r.factors["disturb.friction"] > 0.5) for r in known}
+    done = {
+        r.name: ClimbResult(reached=r.factors["disturb.friction"] > 0.5) for r in known
+    }
     assert next_runs(spec, strand, known, dict(list(done.items())[:-1])) == []
     known = [*known, *next_runs(spec, strand, known, done)]
     assert len(known) == COARSE + ROUND
     ahead = next_runs(spec, strand, known, done)  # no outcome of the last round yet
     assert len(ahead) == ROUND
     for outcome in (True, False):
-        heard = done | {r.name: Outcome(reached=outcome) for r in known[-LAG:]}
+        heard = done | {r.name: ClimbResult(reached=outcome) for r in known[-LAG:]}
         assert next_runs(spec, strand, known, heard) == ahead
 
 

@@ -14,7 +14,7 @@ from clamber.cli import commands, parse
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.verdict import Figure
-from clamber.study.climb import FLAGS, Job, command_of, job_of, run_job
+from clamber.study.climb import FLAGS, Climb, climb_of, command_of, run_climb
 
 
 def parsed(command: str) -> commands.ClimbCommand:
@@ -26,11 +26,13 @@ def parsed(command: str) -> commands.ClimbCommand:
 @pytest.mark.parametrize(
     "job",
     [
-        Job(height=0.275),
-        Job(height=0.3, robot="coman29", controller="pid", speed=0.05, method="lbfgs"),
-        Job(height=0.3, speed="max", demo="a file.yaml", robot="my robots/it's.yaml"),
-        Job(scene="boxes.yaml", disturb=Disturbance(height=-5e-05, x=-0.1, seed=17)),
-        Job(
+        Climb(height=0.275),
+        Climb(
+            height=0.3, robot="coman29", controller="pid", speed=0.05, method="lbfgs"
+        ),
+        Climb(height=0.3, speed="max", demo="a file.yaml", robot="my robots/it's.yaml"),
+        Climb(scene="boxes.yaml", disturb=Disturbance(height=-5e-05, x=-0.1, seed=17)),
+        Climb(
             height=0.1,
             disturb=Disturbance(
                 friction=0.31,
@@ -48,7 +50,7 @@ def parsed(command: str) -> commands.ClimbCommand:
         ),
     ],
 )
-def test_the_command_of_a_job_is_that_job(job: Job):
+def test_the_command_of_a_job_is_that_job(job: Climb):
     climb = parsed(command_of(job))
     assert climb.demo == job.demo
     assert climb.world.robot == job.robot
@@ -62,7 +64,7 @@ def test_the_command_of_a_job_is_that_job(job: Job):
 
 
 def test_a_command_names_what_differs_and_no_more():
-    job = Job(height=0.275, disturb=Disturbance(friction=0.31, seed=17))
+    job = Climb(height=0.275, disturb=Disturbance(friction=0.31, seed=17))
     assert command_of(job) == (
         "clamber climb --robot coman --height 0.275 --controller mixed"
         " --disturb.friction 0.31 --disturb.seed 17"
@@ -71,8 +73,8 @@ def test_a_command_names_what_differs_and_no_more():
 
 def test_flags_have_the_defaults_of_the_command():
     climb = parsed("clamber climb --height 0.275")
-    job = job_of({"height": 0.275})
-    assert job == Job(height=0.275)
+    job = climb_of({"height": 0.275})
+    assert job == Climb(height=0.275)
     assert (climb.demo, climb.world.robot) == (job.demo, job.robot)
     assert (climb.planning.method, climb.planning.speed) == (job.method, job.speed)
     assert climb.execution.controller == job.controller
@@ -81,7 +83,7 @@ def test_flags_have_the_defaults_of_the_command():
 
 
 def test_flags_are_checked_one_by_one():
-    assert job_of({"height": 0.3, "disturb.mass": 1.1}).disturb.mass == 1.1
+    assert climb_of({"height": 0.3, "disturb.mass": 1.1}).disturb.mass == 1.1
     for flags, said in (
         ({"hight": 0.3}, "flag is 'hight'; expected one of demo, robot, height"),
         ({"height": "x"}, "height is 'x'"),
@@ -93,7 +95,7 @@ def test_flags_are_checked_one_by_one():
         ({"height": 0.3, "contacts": "none"}, "contacts is 'none'"),
     ):
         with pytest.raises(InputError) as wrong:
-            job_of(flags)
+            climb_of(flags)
         assert said in str(wrong.value)
     assert "disturb.friction" in FLAGS
     assert "search.depth" in FLAGS
@@ -101,14 +103,14 @@ def test_flags_are_checked_one_by_one():
 
 
 def test_jobs_are_equal_by_value():
-    a = Job(height=0.3, disturb=Disturbance(mass=1.1))
+    a = Climb(height=0.3, disturb=Disturbance(mass=1.1))
     assert a == replace(a)
     assert hash(a) == hash(replace(a))
     assert a != replace(a, disturb=Disturbance())
 
 
 def test_a_box_out_of_reach_is_an_outcome():
-    outcome = run_job(Job(height=3.0))
+    outcome = run_climb(Climb(height=3.0))
     assert not outcome.reached
     assert outcome.why.startswith("no plan: ")
     assert "within" in outcome.why
@@ -116,13 +118,13 @@ def test_a_box_out_of_reach_is_an_outcome():
 
 
 def test_a_fall_ends_the_run_and_is_the_reason():
-    job = Job(
+    job = Climb(
         height=0.275,
         controller="pid",
         speed=1.0,
         disturb=Disturbance(effort=0.05),
     )
-    outcome = run_job(job)
+    outcome = run_climb(job)
     assert (outcome.reached, outcome.why) == (False, "fell")
     assert 0.0 < outcome.seconds < 5.0
 
@@ -131,14 +133,14 @@ def test_a_fall_ends_the_run_and_is_the_reason():
 @pytest.mark.parametrize(
     "job",
     [
-        Job(height=0.275, controller="pid", speed=1.0, disturb=Disturbance(x=0.01)),
-        Job(
+        Climb(height=0.275, controller="pid", speed=1.0, disturb=Disturbance(x=0.01)),
+        Climb(
             height=0.275,
             controller="pid",
             speed=1.0,
             disturb=Disturbance(friction=0.05, seed=7),
         ),
-        Job(
+        Climb(
             height=0.275,
             controller="mixed",
             disturb=Disturbance(friction=0.6, unevenness=0.02, push=20.0, seed=17),
@@ -146,9 +148,9 @@ def test_a_fall_ends_the_run_and_is_the_reason():
     ],
 )
 def test_the_command_of_a_row_gives_its_verdict(
-    job: Job, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    job: Climb, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    outcome = run_job(job)
+    outcome = run_climb(job)
     words = shlex.split(command_of(job))[1:]
     code = cli.main([*words, "--json", "--out", str(tmp_path)])
     record = json.loads(capsys.readouterr().out)
