@@ -72,7 +72,7 @@ _HOME = {
     "load_spec": "study.spec",
     "load_sweep": "study.sweep",
     "midway_of": "planning.substitutes",
-    "open_view": "show.view",
+    "open_view": "show.live",
     "new_run_folder": "run.folder",
     "pelvis_distribution": "contact.policy",
     "plan": "planning.planner",

@@ -727,7 +727,7 @@ class ViewCommand:
 
     def run(self) -> int:
         """Serve until Ctrl-C."""
-        from clamber.show.view import open_view
+        from clamber.show.live import open_view
 
         place: dict[str, Any] = {"host": self.host, "port": self.port}
         page = open_view(

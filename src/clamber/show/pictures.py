@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +47,14 @@ from clamber.show.renderer import (
     video,
     view_of,
 )
-from clamber.show.sample import changed, describe_change, row_at, sample_motion, thinned
+from clamber.show.sample import (
+    changed,
+    describe_change,
+    force_by_contact,
+    row_at,
+    sample_motion,
+    thinned,
+)
 from clamber.step.posture import Keyframe
 
 SAMPLES = 400  # of a plot over time
@@ -185,7 +191,9 @@ def mark_keyframe(
     draw.line((a, b), fill=DARK, width=1)
     _dot(draw, a, 5, DARK)
     draw.line((b[0] - 5, b[1], b[0] + 5, b[1]), fill=DARK, width=2)
-    for state, force in zip(key.contacts, _force_by_contact(world, key), strict=True):
+    forces = force_by_contact(world, key)
+    for state in key.contacts:
+        force = forces[state.contact.surface]
         colour = PHASE_COLOURS[state.phase]
         at = state.contact.position
         ends = np.array([at, at + FORCE_LENGTH / weight * force])
@@ -193,20 +201,6 @@ def mark_keyframe(
         if np.linalg.norm(tip - tail) > 8:
             _arrow(draw, tail, tip, colour)
         _dot(draw, tuple(tail), 5, colour)
-
-
-def _force_by_contact(world: World, key: Keyframe) -> list[np.ndarray]:
-    """(3,) [N] of each contact, over all its bearing points; zeros where unknown."""
-    kin = Kinematics(world)
-    kin.update(key.q)
-    counts = []
-    for c in key.stance:
-        normal = world.supports[c.support].normal
-        counts.append(len(kin.bearing_points(c.surface, normal, c.edge)))
-    if sum(counts) != len(key.equilibrium.forces):
-        return [np.zeros(3)] * len(counts)
-    ends = np.cumsum([0, *counts])
-    return [key.equilibrium.forces[a:b].sum(axis=0) for a, b in pairwise(ends)]
 
 
 def _dot(

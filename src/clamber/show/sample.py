@@ -38,7 +38,9 @@ from clamber.run.folder import (
     load_plan,
     load_rollout,
 )
+from clamber.step.posture import Keyframe
 from clamber.step.statics import (
+    Phase,
     com_margin,
     projected_distance,
     support_polygon,
@@ -279,6 +281,24 @@ def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
     return times
 
 
+def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
+    """(3,) [N] of each surface, over all its bearing points; zeros where unknown."""
+    kin = Kinematics(world)
+    kin.update(key.q)
+    counts = []
+    for c in key.stance:
+        normal = world.supports[c.support].normal
+        counts.append(len(kin.bearing_points(c.surface, normal, c.edge)))
+    forces = key.equilibrium.forces
+    if sum(counts) != len(forces):
+        return {c.surface: np.zeros(3) for c in key.stance}
+    ends = np.cumsum([0, *counts])
+    return {
+        c.surface: forces[a:b].sum(axis=0)
+        for c, (a, b) in zip(key.stance, pairwise(ends), strict=True)
+    }
+
+
 # The motion, sampled.
 
 
@@ -333,6 +353,37 @@ class Motion:
     loads: list[list[tuple[float, float]]] | None
     events: list[float]
     felt: list[float]
+
+    def phase(self, row: int, surface: int) -> Phase | None:
+        """Of a contact that is planned or bears at a sample; None where there is none.
+
+        Args:
+            row: Index of the sample.
+            surface: Index of the surface.
+        """
+        planned = self.planned is not None and bool(self.planned[row, surface])
+        loaded = planned if self.loaded is None else bool(self.loaded[row, surface])
+        if not (planned or loaded):
+            return None
+        if self.distance[row, surface] > self.limit[row, surface]:
+            return "sliding"
+        return "supporting" if loaded else "reach-to-supportable"
+
+    def swing_after(self, row: int) -> np.ndarray:
+        """(m, 3) way of the surface that makes the next planned contact [m].
+
+        Empty where none comes.
+        """
+        if self.planned is None or self.stills:
+            return np.zeros((0, 3))
+        made = self.planned[1:] & ~self.planned[:-1]
+        later = np.flatnonzero(made[row:].any(axis=1))
+        if not len(later):
+            return np.zeros((0, 3))
+        end = row + int(later[0]) + 1
+        j = int(np.flatnonzero(made[end - 1])[0])
+        earlier = [i for i in range(end) if self.planned[i, j] or made[i - 1].any()]
+        return self.points[earlier[-1] if earlier else 0 : end + 1, j]
 
 
 def sample_motion(
@@ -501,6 +552,43 @@ def support_below(world: World, kin: Kinematics, surface: str) -> Support:
         return abs(float(s.height(point))) + outside
 
     return min(world.supports.values(), key=gap)
+
+
+def posture_at(motion: Motion, q: np.ndarray, t: float) -> np.ndarray:
+    """(nq,) of postures (n, nq) of a motion at a time [s]; of stills the last one."""
+    time = motion.time
+    row = row_at(time, t)
+    after = min(row + 1, len(time) - 1)
+    if motion.stills or after == row:
+        return q[row]
+    share = min(max((t - time[row]) / (time[after] - time[row]), 0.0), 1.0)
+    a, b = q[row], q[after].copy()
+    b[3:7] *= 1.0 if a[3:7] @ b[3:7] >= 0 else -1.0
+    out = (1 - share) * a + share * b
+    out[3:7] /= np.linalg.norm(out[3:7])
+    return out
+
+
+def support_polygon_at(motion: Motion, kin: Kinematics, row: int) -> np.ndarray:
+    """(K, 3) support polygon of what bears at a sample, at its highest contact [m].
+
+    Args:
+        motion: The run.
+        kin: At the posture then.
+        row: Index of the sample; empty where nothing bears.
+    """
+    bears = motion.planned if motion.loaded is None else motion.loaded
+    supports = list(motion.world.supports.values())
+    points = [
+        bearing_of(kin, surface, supports[motion.support[row, j]])
+        for j, surface in enumerate(motion.world.surfaces)
+        if bears is not None and bears[row, j]
+    ]
+    if not points:
+        return np.zeros((0, 3))
+    found = np.concatenate(points)
+    flat = support_polygon(found[:, :2])
+    return np.column_stack([flat, np.full(len(flat), found[:, 2].max())])
 
 
 def _errors(world: World, q: np.ndarray, q_ref: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ scale; planning it again is `pipeline.plan`, as ever.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -35,7 +35,7 @@ FOLDER = "edited"  # in the run folder
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Spell:
+class Interval:
     """A contact over the stances of a sequence that hold it.
 
     Attributes:
@@ -60,7 +60,7 @@ class Edits:
     """What a person wants otherwise.
 
     Attributes:
-        moved: Place (3,) of contacts by the index of their spell [m].
+        moved: Place (3,) of contacts by the index of their interval [m].
         off: Surfaces that are not to be used.
     """
 
@@ -74,7 +74,7 @@ class Edits:
         return bool(self.moved or self.off)
 
 
-def spells_of(made: Plan) -> tuple[Spell, ...]:
+def intervals_of(made: Plan) -> tuple[Interval, ...]:
     """The contacts of a plan's sequence that can be moved: those made on the way."""
     sequence = made.sequence
     planned = {
@@ -97,7 +97,7 @@ def spells_of(made: Plan) -> tuple[Spell, ...]:
                 key = planned.get((i, surface))
                 at = [x for x in key.stance if x.surface == surface] if key else []
                 out.append(
-                    Spell(
+                    Interval(
                         contact=c,
                         first=i,
                         last=j,
@@ -151,15 +151,17 @@ def edited_sequence(made: Plan, edits: Edits) -> ContactSequence:
     """The sequence of a plan with the edits in it.
 
     Raises:
-        KeyError: A spell is none of the plan's.
+        KeyError: A interval is none of the plan's.
     """
-    spells = dict(enumerate(spells_of(made)))
+    intervals = dict(enumerate(intervals_of(made)))
     stances = list(made.sequence.stances)
     for index, place in edits.moved.items():
-        spell = spells[index]
-        support = made.world.supports[spell.contact.support]
-        contact = replace(spell.contact, position=clamped(support, place), fixed=True)
-        for i in range(spell.first, spell.last):
+        interval = intervals[index]
+        support = made.world.supports[interval.contact.support]
+        contact = replace(
+            interval.contact, position=clamped(support, place), fixed=True
+        )
+        for i in range(interval.first, interval.last):
             stances[i] = replace(
                 stances[i],
                 contacts=tuple(
@@ -210,3 +212,28 @@ def save_edited(
         save_rollout(made, done[0], out)
         save_verdict(done[1], out)
     return out
+
+
+def paired_times(
+    plan: Plan, reached: Sequence[float | None], end: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) of robot and person at which they make the same contact [s].
+
+    Between them the one clock is the other one, stretched.
+
+    Args:
+        plan: What was to be done.
+        reached: When each keyframe is reached [s].
+        end: Of the robot's motion [s].
+    """
+    t = plan.sequence.t
+    robot, person = [0.0], [float(t[0])]
+    for i, step in keyframe_steps(plan):
+        at = reached[i]
+        if at is not None and at > robot[-1]:
+            robot.append(at)
+            person.append(float(t[step.stance]))
+    if end > robot[-1]:
+        robot.append(end)
+        person.append(float(t[-1]))
+    return np.array(robot), np.array(person)

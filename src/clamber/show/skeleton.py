@@ -1,6 +1,6 @@
-"""A recording as a stick figure: bones, joints and detected contacts over time.
+"""A recording as bones, joints and detected contacts over time.
 
-Shapes: T samples, B bones, J joints.
+Shapes: T samples, F points, B bones.
 """
 
 from __future__ import annotations
@@ -9,25 +9,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clamber.contact.contact import ContactSequence
+from clamber.contact.contact import ContactInterval, ContactSequence
 from clamber.model.scene import Scene
 from clamber.recording.demonstration import SIDES, Demonstration, wrist
-from clamber.show.view.shown import Touch
 
 CHEST = "Chest"  # the middle of the shoulders, which no recording has
 GAP = 0.3  # [m] between the robot's scene and the person's
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Person:
+class Skeleton:
     """A recording as it is shown.
 
     Attributes:
         sequence: What was detected in it; None where that could not be done.
-        position: (T, F, 3) points [m], in the robot's world; seen: (T, F) bool.
+        position: (T, F, 3) points [m]; seen: (T, F) bool.
         bones: (B, 2) indices of their ends among the points.
-        joints: (J,) indices of the points that are ends of bones, the head last.
-        offset: (3,) where its world is put [m].
+        head: Index of the head among the points; None where there is none.
     """
 
     demo: Demonstration
@@ -35,36 +33,34 @@ class Person:
     position: np.ndarray
     seen: np.ndarray
     bones: np.ndarray
-    joints: np.ndarray
-    offset: np.ndarray
+    head: int | None
+
+    def at(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Points (F, 3) [m] at a time [s], its ends outside of it; seen: (F,) bool."""
+        times = self.demo.t
+        i = int(np.clip(np.searchsorted(times, t, "right") - 1, 0, len(times) - 2))
+        share = np.clip((t - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0)
+        p = (1 - share) * self.position[i] + share * self.position[i + 1]
+        return p, self.seen[i]
+
+    def contacts(self, t: float) -> list[ContactInterval]:
+        """Contacts that were detected at a time [s]."""
+        found = () if self.sequence is None else self.sequence.intervals
+        return [x for x in found if x.t0 <= t < x.t1]
+
+    def changes(self) -> list[float]:
+        """When the stance changes, and both ends [s]."""
+        t = self.demo.t
+        inner = [] if self.sequence is None else self.sequence.t[1:-1].tolist()
+        return sorted({float(t[0]), float(t[-1]), *inner})
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Figure:
-    """The person at a time.
-
-    Attributes:
-        bones: (B, 2, 3) their ends [m].
-        joints: (J, 3) [m].
-        seen: (B,) bool, both ends were recorded then.
-        touches: Contacts, where they were detected.
-    """
-
-    bones: np.ndarray
-    joints: np.ndarray
-    seen: np.ndarray
-    touches: tuple[Touch, ...]
-
-
-def show_person(
-    demo: Demonstration, sequence: ContactSequence | None, offset: np.ndarray
-) -> Person:
+def skeleton_of(demo: Demonstration, sequence: ContactSequence | None) -> Skeleton:
     """Find the bones of a recording.
 
     Args:
         demo: The recording.
         sequence: What was detected in it, at the person's scale.
-        offset: (3,) where its world is put [m].
     """
     names = (*demo.names, CHEST)
     at = {n: i for i, n in enumerate(names)}
@@ -76,56 +72,18 @@ def show_person(
         pairs += [(hand, side + "Hand"), (side + "Hand", side + "Hand.tip")]
         pairs += [(side + a, side + b) for a, b in (("Hip", "Knee"), ("Knee", "Foot"))]
         pairs += [(side + "Foot", side + "Foot.toe")]
-    bones = np.array(
-        [(at[a], at[b]) for a, b in pairs if a in at and b in at and a != b]
-    )
-    joints = np.unique(bones)
-    if "Head" in at:
-        joints = np.append(joints[joints != at["Head"]], at["Head"])
     shoulders = [at["LShoulder"], at["RShoulder"]]
     chest = demo.position[:, shoulders].mean(axis=1, keepdims=True)
     both = demo.valid[:, shoulders].all(axis=1, keepdims=True)
-    offset = np.asarray(offset, dtype=float)
-    return Person(
+    return Skeleton(
         demo=demo,
         sequence=sequence,
-        position=np.concatenate([demo.position, chest], axis=1) + offset,
+        position=np.concatenate([demo.position, chest], axis=1),
         seen=np.concatenate([demo.valid, both], axis=1),
-        bones=bones,
-        joints=joints,
-        offset=offset,
-    )
-
-
-def figure_at(person: Person, t: float) -> Figure:
-    """The person at a time of the recording [s]; at its ends outside of it."""
-    demo = person.demo
-    t = float(np.clip(t, demo.t[0], demo.t[-1]))
-    i = min(int(np.searchsorted(demo.t, t, side="right")) - 1, len(demo.t) - 2)
-    share = (t - demo.t[i]) / (demo.t[i + 1] - demo.t[i])
-    p = (1 - share) * person.position[i] + share * person.position[i + 1]
-    touches = []
-    for x in person.sequence.intervals if person.sequence is not None else ():
-        if not x.t0 <= t < x.t1:
-            continue
-        support = demo.scene.support(x.contact.support)
-        touches.append(
-            Touch(
-                surface=x.part,
-                support=support.name,
-                position=x.contact.position + person.offset,
-                normal=support.normal,
-                friction=support.friction,
-                loaded=True,
-                phase="supporting",
-                force=None,
-            )
-        )
-    return Figure(
-        bones=p[person.bones],
-        joints=p[person.joints],
-        seen=person.seen[i, person.bones].all(axis=1),
-        touches=tuple(touches),
+        bones=np.array(
+            [(at[a], at[b]) for a, b in pairs if a in at and b in at and a != b]
+        ),
+        head=at.get("Head"),
     )
 
 
@@ -157,11 +115,3 @@ def _corners(scene: Scene) -> np.ndarray:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     corners = [b.position + (signs * b.size / 2) @ b.rotation.T for b in scene.boxes]
     return np.concatenate(corners) if corners else np.zeros((0, 3))
-
-
-def change_times(person: Person) -> list[float]:
-    """When the stance changes, and both ends [s]."""
-    t = person.demo.t
-    ends = [float(t[0]), float(t[-1])]
-    inner = [] if person.sequence is None else person.sequence.t[1:-1].tolist()
-    return sorted({*ends, *(float(x) for x in inner)})
