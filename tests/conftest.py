@@ -237,22 +237,6 @@ def one_hand_rollout(one_hand_plan):
 
 
 @pytest.fixture(scope="module")
-def ran(one_hand_plan, one_hand_rollout):
-    """As the view shows it."""
-    from clamber.show.view.shown import show_run
-
-    return show_run(one_hand_plan, one_hand_rollout)
-
-
-@pytest.fixture(scope="module")
-def planned(one_hand_plan):
-    """Before it is run."""
-    from clamber.show.view.shown import show_run
-
-    return show_run(one_hand_plan, None)
-
-
-@pytest.fixture(scope="module")
 def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
     """The run folder of that motion; of the module alone, which may write in it."""
     from clamber import judge
