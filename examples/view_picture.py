@@ -29,18 +29,17 @@ def main(run: str, out: str, scheme: str = "light", size: str = "1280x800") -> N
         browser = p.chromium.launch(
             executable_path=shutil.which("chromium"), args=FLAGS
         )
-        tab = browser.new_page(
-            viewport={"width": width, "height": height}, color_scheme=scheme
-        )
+        tab = browser.new_page(viewport={"width": width, "height": height})
         tab.set_default_timeout(120_000)
-        tab.goto(page.url)
-        tab.wait_for_selector("text=go to", state="attached")
+        tab.goto(page.url + ("/?darkMode" if scheme == "dark" else ""))
+        tab.wait_for_selector("text=speed")
         tab.add_style_tag(content=".mantine-Notification-root {display: none}")
         tab.wait_for_timeout(3000)
         if width > 600:
-            tab.get_by_role("tab", name="Show").click()
+            tab.get_by_text("Show", exact=True).click()
             switch(tab, "recording")
-            tab.get_by_role("tab", name="Stances").click()
+            switch(tab, "shadows")
+            tab.get_by_role("button", name="corner", exact=True).click()
         tab.wait_for_timeout(1000)
         page.clock.go(0.56 * page.clock.end)
         tab.wait_for_timeout(4000)

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from clamber.errors import ClamberError
-from clamber.execution.simulation import Rollout, Verdict, judge, simulate
+from clamber.execution.simulation import Rollout, simulate
+from clamber.execution.verdict import Verdict, judge
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning.records import Plan
 from clamber.show.edits import (

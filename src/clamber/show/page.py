@@ -33,10 +33,7 @@ PORTS = 50  # tried, one after the other
 PANEL_WIDTH, ASPECT = 360, 1.2  # [px]; of the picture beside it
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 PLAY, PAUSE, BACK, ON = "play", "pause", "< contact", "contact >"
-GRIDS = {  # sections and cells of the ground, by whether it is dark
-    False: ((176, 183, 192), (214, 219, 225)),
-    True: ((84, 90, 98), (52, 57, 64)),
-}
+SECTIONS, CELLS = (150, 157, 166), (176, 183, 192)  # of the ground, light and dark
 
 
 class Clock:
@@ -231,19 +228,18 @@ class Page:
         sun = scene.add_light_directional(
             "/lights/sun", intensity=2.2, position=(-1.5, -2.5, 4.0)
         )
-        ground = scene.add_grid(
+        scene.add_grid(
             "/ground",
             8.0,
             8.0,
             cell_size=0.1,
             section_size=0.5,
-            section_color=GRIDS[False][0],
-            cell_color=GRIDS[False][1],
+            section_color=SECTIONS,
+            cell_color=CELLS,
             fade_distance=9.0,
             shadow_opacity=0.25,
         )
         cameras = gui.add_button_group("camera", tuple(PRESETS))
-        dark = gui.add_checkbox("dark", False)
         shadows = gui.add_checkbox("shadows", False)
 
         @cameras.on_click
@@ -253,13 +249,6 @@ class Page:
                 with event.client.atomic():
                     event.client.camera.position = eye_of(view)
                     event.client.camera.look_at = view.lookat
-
-        @dark.on_update
-        def _(_: Any) -> None:
-            gui.configure_theme(
-                dark_mode=dark.value, show_logo=False, show_share_button=False
-            )
-            ground.section_color, ground.cell_color = GRIDS[dark.value]
 
         @shadows.on_update
         def _(_: Any) -> None:
