@@ -69,12 +69,12 @@ from clamber.run.folder import save_proposal as save_proposal
 from clamber.run.folder import save_rollout as save_rollout
 from clamber.run.folder import save_sequence as save_sequence
 from clamber.run.folder import save_verdict as save_verdict
+from clamber.show.live import open_view as open_view
 from clamber.show.pictures import draw_robot as draw_robot
 from clamber.show.pictures import draw_scene as draw_scene
 from clamber.show.pictures import render_run as render_run
 from clamber.show.report import Reported as Reported
 from clamber.show.report import write_report as write_report
-from clamber.show.live import open_view as open_view
 from clamber.study.climb import Climb as Climb
 from clamber.study.climb import ClimbResult as ClimbResult
 from clamber.study.climb import run_climb as run_climb
