@@ -1,4 +1,4 @@
-"""Time of contact detection on 25 s at 120 Hz; prints the median in seconds."""
+"""Time of contact detection on the built-in climb; prints the median in seconds."""
 
 from __future__ import annotations
 
@@ -6,19 +6,13 @@ import statistics
 import sys
 import time
 
-import numpy as np
-
 from clamber.recording.detect import detect_contacts
-from clamber.recording.synthetic import ClimbOptions, synthesize_climb
-
-DURATION = 25.0  # [s] of the recording
-USUAL = 21.5  # [s] of the built-in climb at its usual speed
+from clamber.recording.recording import load_demo
 
 
 def main(repeats: int = 9) -> None:
     """Detect a few times after one warm-up."""
-    options = ClimbOptions(speed=USUAL / DURATION)
-    demo, _ = synthesize_climb(np.random.default_rng(0), options=options)
+    demo = load_demo("climb")
     detect_contacts(demo)
     took = []
     for _ in range(repeats):

@@ -22,7 +22,7 @@ from clamber.model.scene import Scene
 from clamber.planning.planner import plan
 from clamber.planning.records import Method, Plan, PlanOptions
 from clamber.recording.detect import detect_contacts
-from clamber.recording.library import load_demo
+from clamber.recording.recording import load_demo
 
 
 def table(result: Plan) -> None:

@@ -16,7 +16,7 @@ from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.planning.planner import plan
 from clamber.recording.detect import detect_contacts
-from clamber.recording.library import load_demo
+from clamber.recording.recording import load_demo
 
 HEIGHT = 0.275  # [m]
 REPEATS = 5

@@ -2,6 +2,8 @@
 
 Each file is made in a temporary folder and read by a process of its own, so that the
 peak is that of the reader: once as named points, once as a demonstration.
+
+    PYTHONPATH=src:tests python benchmarks/bench_read.py
 """
 
 from __future__ import annotations
@@ -13,11 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from clamber.recording.c3d import write_c3d
-from clamber.recording.demonstration import Demonstration
-from clamber.recording.library import load_demo
-from clamber.recording.synthetic import synthesize_climb
-from clamber.recording.trc import write_trc
+from clamber.recording.recording import load_demo
+from support.files import c3d_bytes, from_z_up, trc_text
 
 SECONDS, RATE, MARKERS = 600.0, 240.0, 60
 FORMATS = ("c3d", "trc", "csv", "bvh", "npz")
@@ -25,7 +24,7 @@ FORMATS = ("c3d", "trc", "csv", "bvh", "npz")
 
 def recording(count: int) -> tuple[list[str], np.ndarray]:
     """Names, and (T, F, 3) of the built-in climb, drawn out, with further points."""
-    demo, _ = synthesize_climb(np.random.default_rng(0))
+    demo = load_demo("climb")
     names = [*demo.names, *(f"more{k}" for k in range(MARKERS - len(demo.names)))]
     t = np.linspace(demo.t[0], demo.t[-1], count)
     k = np.arange(MARKERS) % len(demo.names)
@@ -84,18 +83,15 @@ def write(kind: str, path: Path) -> None:
         write_bvh(p, path)
     elif kind == "npz":
         np.savez(path, positions=p.astype(np.float32), names=names, rate=RATE)
+    elif kind == "c3d":
+        path.write_bytes(c3d_bytes(1000.0 * p, names, rate=RATE))
     else:
-        demo = Demonstration(
-            source="bench", t=np.arange(len(p)) / RATE, names=tuple(names), position=p,
-            valid=np.ones(p.shape[:2], dtype=bool), scene=load_demo("climb").scene,
-            subject={},
-        )  # fmt: skip
-        {"c3d": write_c3d, "trc": write_trc}[kind](demo, path)
+        path.write_text(trc_text(1000.0 * from_z_up(p, "y"), names, RATE))
 
 
 READ = """
 import resource, sys, time
-from clamber.demo import load_demo, read_points
+from clamber.recording.recording import load_demo, read_points
 from pathlib import Path
 call = {"points": read_points, "demo": load_demo}[sys.argv[1]]
 start, cpu = time.perf_counter(), time.process_time()

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from clamber.recording.demonstration import Demonstration
-from clamber.recording.library import load_demo
+from clamber.recording.recording import load_demo
 
 BONES = [
     *((s + a, s + b) for s in "LR" for a, b in (

@@ -113,7 +113,7 @@ def coman():
 def demo_sequence():
     """What is detected in the built-in climb, at the person's scale."""
     from clamber.recording.detect import detect_contacts
-    from clamber.recording.library import load_demo
+    from clamber.recording.recording import load_demo
 
     return detect_contacts(load_demo("climb"))
 

@@ -21,6 +21,7 @@ from clamber import cli
 from clamber.cli import commands, output
 from clamber.execution.events import Lost
 from clamber.execution.verdict import Figure
+from support.files import write_take
 
 COMMANDS = (
     *("climb", "contacts", "plan", "replan", "simulate", "learn"),
@@ -456,7 +457,7 @@ def test_contacts_says_by_how_much_the_floor_was_off(
 
     demo = clamber.load_demo("climb")
     lifted = replace(demo, position=demo.position + np.array([0.0, 0.0, 0.035]))
-    clamber.write_c3d(lifted, tmp_path / "take.c3d")
+    write_take(lifted, tmp_path / "take.c3d")
     out = ["--out", str(tmp_path / "out"), "--json"]
     assert cli.main(["contacts", str(tmp_path / "take.c3d"), "--fit-floor", *out]) == 0
     notes = json.loads(capsys.readouterr().out)["notes"]

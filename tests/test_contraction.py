@@ -24,10 +24,10 @@ from clamber.contact.policy import GeneralPolicy, pelvis_rotation
 from clamber.errors import InputError
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix, wrap
-from clamber.recording.crossing import CrossingOptions, synthesize_crossing
 from clamber.recording.detect import detect_contacts
-from clamber.recording.library import load_demo
+from clamber.recording.recording import load_demo
 from clamber.run.folder import load_sequence, save_sequence
+from support.crossing import CrossingOptions, synthesize_crossing
 
 HEIGHT = 0.6
 SUBJECT = {

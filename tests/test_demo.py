@@ -16,11 +16,18 @@ from clamber.contact.contact import PARTS
 from clamber.errors import InputError
 from clamber.model.scene import Scene
 from clamber.model.se3 import matrix_from_rpy
-from clamber.recording.boxes import read_obj_boxes
-from clamber.recording.demonstration import Demonstration, build_demonstration, runs
-from clamber.recording.library import load_demo
-from clamber.recording.marker_sets import recognise
-from clamber.recording.synthetic import ClimbOptions, synthesize_climb
+from clamber.model.terrain import read_obj
+from clamber.recording.built_in import BUILT_IN
+from clamber.recording.demonstration import (
+    Demonstration,
+    RawTracks,
+    build_demonstration,
+    runs,
+)
+from clamber.recording.recording import load_demo
+from clamber.recording.skeleton import recognise
+from support.built_in import MADE, SEED
+from support.climb import ClimbOptions, synthesize_climb
 
 NAMES = [
     "Hips",
@@ -124,7 +131,7 @@ def test_boxes_are_fitted_exactly_whatever_the_order_of_their_vertices(tmp_path,
         truth.append((size, centre, yaw))
         text += box_obj(size, centre, yaw, first=k)
     (tmp_path / "b.obj").write_text(text)
-    boxes = read_obj_boxes(tmp_path / "b.obj")
+    boxes = read_obj(tmp_path / "b.obj")
     assert [b.name for b in boxes] == [f"box{k}" for k in range(1, 7)]
     for box, (size, centre, yaw) in zip(boxes, truth, strict=True):
         np.testing.assert_allclose(box.position, centre, atol=1e-7)
@@ -141,7 +148,7 @@ def test_objects_of_an_obj_give_boxes_their_names(tmp_path):
     text = box_obj([1, 2, 0.5], [0, 0, 0.25], 0.3, name="step")
     text += box_obj([1, 1, 1], [3, 0, 0.5], 0.0, name="table")
     (tmp_path / "b.obj").write_text(text)
-    assert [b.name for b in read_obj_boxes(tmp_path / "b.obj")] == ["step", "table"]
+    assert [b.name for b in read_obj(tmp_path / "b.obj")] == ["step", "table"]
 
 
 def test_a_box_that_is_the_ground_lowers_the_world_to_its_top(write, tmp_path):
@@ -294,7 +301,7 @@ def test_a_unit_that_is_not_said_is_told_from_the_shank(write, unit, scale):
 def test_an_obj_of_no_boxes_is_refused(tmp_path, text, word):
     (tmp_path / "b.obj").write_text(text)
     with pytest.raises(InputError, match=word):
-        read_obj_boxes(tmp_path / "b.obj")
+        read_obj(tmp_path / "b.obj")
 
 
 @pytest.mark.parametrize("name", ["clmb", "recording.csv", "none.yaml", "none.npy"])
@@ -336,9 +343,14 @@ def test_a_point_never_seen_is_dropped_unless_it_is_needed():
     p[:, NAMES.index("LeftToeBase")] = np.nan
     columns = {k: c[0] for k, c in recognise(NAMES).columns.items()}
     demo = build_demonstration(
-        p[:, list(columns.values())], names=list(columns), rate=30.0,
-        scene=Scene(start=np.zeros(3)), source="x",
-    )  # fmt: skip
+        RawTracks(
+            source="x",
+            names=tuple(columns),
+            position=p[:, list(columns.values())],
+            rate=30.0,
+            scene=Scene(start=np.zeros(3)),
+        )
+    )
     assert "LFoot.toe" not in demo.names
     assert "RFoot.toe" in demo.names
 
@@ -443,6 +455,22 @@ def test_the_built_in_climb_is_always_the_same_and_another_seed_another_one():
     assert any(g.filled for g in a.gaps)
 
 
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_the_shipped_demonstrations_are_what_their_generators_make(name):
+    synthesize, _, options = MADE[name]
+    made, _ = synthesize(np.random.default_rng(SEED), options=options)
+    shipped = load_demo(name)
+    np.testing.assert_allclose(shipped.position, made.position, atol=1e-16)
+    np.testing.assert_array_equal(shipped.t, made.t)
+    assert (shipped.names, shipped.source, shipped.gaps) == (
+        made.names, made.source, made.gaps,
+    )  # fmt: skip
+    (box,), (other,) = shipped.scene.boxes, made.scene.boxes
+    np.testing.assert_array_equal(
+        [box.size, box.position], [other.size, other.position]
+    )
+
+
 def test_noise_is_as_large_as_asked_for():
     quiet, _ = synthesize_climb(
         np.random.default_rng(3), options=ClimbOptions(noise=0.0, gaps=0)
@@ -454,7 +482,7 @@ def test_noise_is_as_large_as_asked_for():
 
 
 def test_importing_demonstrations_does_not_import_scipy():
-    code = "import sys, clamber.demo; sys.exit('scipy' in sys.modules)"
+    code = "import sys, clamber.recording.recording; sys.exit('scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -14,7 +14,11 @@ from clamber.contact.contact import DIRECTIONS, ContactInterval, ContactSequence
 from clamber.errors import InputError
 from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import matrix_from_quat
-from clamber.recording.demonstration import Demonstration, build_demonstration
+from clamber.recording.demonstration import (
+    Demonstration,
+    RawTracks,
+    build_demonstration,
+)
 from clamber.recording.detect import (
     SEAT,
     DetectOptions,
@@ -23,8 +27,8 @@ from clamber.recording.detect import (
     _noise,
     detect_contacts,
 )
-from clamber.recording.library import load_demo
-from clamber.recording.synthetic import ClimbOptions, synthesize_climb
+from clamber.recording.recording import load_demo
+from support.climb import ClimbOptions, synthesize_climb
 
 ORDER = ("LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee")
 
@@ -242,7 +246,13 @@ def test_a_person_of_another_size_makes_the_same_contacts(size):
         start=demo.scene.start,
     )
     scaled = build_demonstration(
-        size * demo.position, names=demo.names, rate=demo.rate, scene=scene, source="x"
+        RawTracks(
+            source="x",
+            names=demo.names,
+            position=size * demo.position,
+            rate=demo.rate,
+            scene=scene,
+        )
     )
     assert scaled.offsets["Knee"] == pytest.approx(size * demo.offsets["Knee"])
     assert np.abs(errors(detect_contacts(scaled), truth)).max() < 0.06

@@ -253,7 +253,7 @@ def test_as_slowly_as_in_the_experiments(demo_sequence, coman, tmp_path, ask_jud
 @pytest.mark.slow
 def test_a_real_recording_is_climbed(coman, shared, tmp_path, ask_judge):
     from clamber.recording.detect import detect_contacts
-    from clamber.recording.library import load_demo
+    from clamber.recording.recording import load_demo
 
     if not (shared / "demos" / "climb-0" / "joints.npy").is_file():
         pytest.skip("no recording climb-0 beside the repository")
@@ -272,7 +272,7 @@ def test_the_robot_stands_up_as_the_person_does(
 ):
     """On hands and knees, then on its feet; climb-1 at its own ratio is 0.42 m."""
     from clamber.recording.detect import detect_contacts
-    from clamber.recording.library import load_demo
+    from clamber.recording.recording import load_demo
 
     if not (shared / "demos" / name / "joints.npy").is_file():
         pytest.skip(f"no recording {name} beside the repository")

@@ -62,7 +62,7 @@ _HOME = {
     "judge": "execution.verdict",
     "learn_policy": "contact.learn",
     "limb_lengths": "model.kinematics",
-    "load_demo": "recording.library",
+    "load_demo": "recording.recording",
     "load_plan": "run.folder",
     "load_policy": "run.folder",
     "load_robot": "model.robot",
@@ -93,9 +93,7 @@ _HOME = {
     "save_sequence": "run.folder",
     "save_verdict": "run.folder",
     "simulate": "execution.simulation",
-    "write_c3d": "recording.c3d",
     "write_report": "show.report",
-    "write_trc": "recording.trc",
 }
 
 __all__ = ["__version__", *_HOME]

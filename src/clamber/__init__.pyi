@@ -51,11 +51,9 @@ from clamber.planning.substitutes import plan_or_replan as plan_or_replan
 from clamber.planning.substitutes import replan as replan
 from clamber.planning.substitutes import replan_rest as replan_rest
 from clamber.planning.trajectory import Trajectory as Trajectory
-from clamber.recording.c3d import write_c3d as write_c3d
 from clamber.recording.demonstration import Demonstration as Demonstration
 from clamber.recording.detect import detect_contacts as detect_contacts
-from clamber.recording.library import load_demo as load_demo
-from clamber.recording.trc import write_trc as write_trc
+from clamber.recording.recording import load_demo as load_demo
 from clamber.run.export import Exported as Exported
 from clamber.run.export import export_run as export_run
 from clamber.run.folder import load_plan as load_plan

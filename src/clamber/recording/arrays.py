@@ -1,20 +1,16 @@
 """Bare arrays of joint centres or markers: `.npy`, and `.npz` with names and rate.
 
-Nothing in them is believed before it is checked: a header may claim more than the file
-holds, an archive may unpack to a thousand times its size, and pickles are programs.
+Pickles are programs and are refused; so is what would unpack to more than is sane.
 """
 
 from __future__ import annotations
 
-import io
-import math
 import tokenize
 import warnings
 import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
@@ -22,13 +18,12 @@ from clamber.errors import InputError
 from clamber.recording.points import MAX_POINTS, Points, unique_names
 
 NPY_MAGIC, NPZ_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
-_RATIO = 8  # an archive of recorded numbers never shrinks so far
-_SLACK = 1 << 16  # [byte] small archives may
-_MAX_NAME = 200  # characters
-# What NumPy raises on headers that are none: they are Python literals.
-_WRONG_HEADER = (
-    ValueError, EOFError, TypeError, SyntaxError, RecursionError, MemoryError,
-    tokenize.TokenError,
+MAX_BYTES = 2 << 30  # of an archive, unpacked: three hours of 60 points at 120 Hz
+# What NumPy raises on files that are none; headers are Python literals.
+_WRONG_FILE = (
+    ValueError, EOFError, TypeError, AttributeError, SyntaxError, RecursionError,
+    MemoryError, OverflowError, RuntimeError, tokenize.TokenError, zipfile.BadZipFile,
+    zlib.error, NotImplementedError,
 )  # fmt: skip
 _FIELDS = {
     "positions": ("positions", "joints", "points"),
@@ -70,149 +65,66 @@ def read_array(
         InputError: It is no such file, or nothing says its names or rate.
         OSError: It cannot be opened.
     """
-    with path.open("rb") as file:
-        magic = file.read(len(NPY_MAGIC))
-        file.seek(0)
-        if magic.startswith(NPZ_MAGIC[:2]):
-            raw, own_names, own_rate = _read_npz(file, path)
-        else:
-            size = path.stat().st_size
-            raw, own_names, own_rate = _read_npy(file, size, path), None, None
+    found = _load(path)
+    if "positions" not in found:
+        raise InputError("an array called `positions`", path)
+    raw = found["positions"]
     if raw.dtype.kind not in "fiu":
-        raise InputError("numbers", source=path, field="dtype", value=str(raw.dtype))
-    if raw.ndim != 3 or raw.shape[2] != 3:
-        raise InputError(
-            "an array (samples, points, 3)", source=path, field="shape",
-            value=raw.shape,
-        )  # fmt: skip
-    if raw.shape[1] > MAX_POINTS:
-        raise InputError(
-            f"at most {MAX_POINTS} points", source=path, field="shape", value=raw.shape
-        )
-    names = own_names if names is None else names
-    if names is None and raw.shape[1] in SMPL:
-        names = SMPL[raw.shape[1]][1]
-    rate = own_rate if rate is None else rate
-    for field, value in (("names", names), ("rate", rate)):
-        if value is None:
-            raise InputError(
-                "a value: a bare array has none of its own", source=path, field=field
-            )
-    assert names is not None
-    assert rate is not None
-    if len(names) != raw.shape[1]:
-        raise InputError(
-            f"{raw.shape[1]} names, one a point", source=path, field="names",
-            value=len(names),
-        )  # fmt: skip
-    if len(set(names)) != len(names):
+        raise InputError("numbers", path, "dtype", str(raw.dtype))
+    if raw.ndim != 3 or raw.shape[2] != 3 or raw.shape[1] > MAX_POINTS:
+        expected = f"an array (samples, points, 3) of at most {MAX_POINTS} points"
+        raise InputError(expected, path, "shape", raw.shape)
+    count = raw.shape[1]
+    if names is None and "names" in found:
+        if found["names"].dtype.kind != "U" or found["names"].ndim != 1:
+            raise InputError("a list of names", path, "names")
+        names = found["names"].tolist()
+    if names is None and count in SMPL:
+        names = SMPL[count][1]
+    if rate is None and "rate" in found:
+        if found["rate"].size != 1 or found["rate"].dtype.kind not in "fiu":
+            raise InputError("a number [Hz]", path, "rate")
+        rate = found["rate"].item()
+    none = "a value: a bare array has none of its own"
+    if names is None:
+        raise InputError(none, path, "names")
+    if rate is None:
+        raise InputError(none, path, "rate")
+    if len(names) != count:
+        raise InputError(f"{count} names, one a point", path, "names", len(names))
+    if len(set(names)) != count:
         twice = next(n for n in names if list(names).count(n) > 1)
-        raise InputError("different names", source=path, field="names", value=twice)
+        raise InputError("different names", path, "names", twice)
     if raw.dtype.kind != "f":
         raw = raw.astype(np.float32)
     return Points(names=unique_names(names), position=raw, rate=rate)
 
 
-def _read_npy(file: BinaryIO, size: int, path: Path, member: str = "") -> np.ndarray:
-    """One array, after its header has been held against the bytes there are."""
-    field = member or None
+def _load(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of `_FIELDS` that a file has."""
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("ignore")  # of headers that are odd but readable
-            version = np.lib.format.read_magic(file)
-            read = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }.get(version)
-            if read is None:
-                raise ValueError("version")
-            shape, fortran, dtype = read(file)
-    except _WRONG_HEADER as e:
-        raise InputError(
-            "an array of NumPy, version 1 or 2, that is not pickled", source=path,
-            field=field or "byte 0",
-        ) from e  # fmt: skip
-    if dtype.hasobject or dtype.names is not None or dtype.subdtype is not None:
-        raise InputError(
-            "plain numbers or text; objects are programs and are refused",
-            source=path,
-            field=": ".join(x for x in (member, "dtype") if x),
-            value=str(dtype),
-        )
-    start = file.tell()
-    count = math.prod(shape)
-    if min(shape, default=0) < 0 or start + count * dtype.itemsize > size:
-        raise InputError(
-            f"{count * dtype.itemsize} bytes from byte {start} on, as its header says",
-            source=path,
-            field=field or f"byte {size}",
-        )
-    raw = file.read(count * dtype.itemsize)
-    if len(raw) < count * dtype.itemsize:
-        raise InputError(
-            "as many bytes as its header says", source=path,
-            field=field or f"byte {start + len(raw)}",
-        )  # fmt: skip
-    array = np.frombuffer(raw, dtype=dtype) if raw else np.empty(0, dtype)
-    return array.reshape(shape, order="F" if fortran else "C")
+            if file.read(2) != NPZ_MAGIC[:2]:
+                # Mapped, not read: a header may claim more than the file holds.
+                return {"positions": np.array(np.load(path, mmap_mode="r"))}
+            with zipfile.ZipFile(file) as archive:
+                size = sum(i.file_size for i in archive.infolist())
+            if size > MAX_BYTES:
+                expected = f"at most {MAX_BYTES} bytes, unpacked"
+                raise InputError(expected, path, value=size)
+            with np.load(path, allow_pickle=False) as z:
+                return {
+                    field: z[word]
+                    for field, words in _FIELDS.items()
+                    for word in words[::-1]
+                    if word in z
+                }
+    except _WRONG_FILE as e:
+        expected = f"an array of NumPy without pickled objects ({_fault(e)})"
+        raise InputError(expected, path) from e
 
 
-def _read_npz(
-    file: BinaryIO, path: Path
-) -> tuple[np.ndarray, list[str] | None, float | None]:
-    """Positions, and names and rate where the archive has them."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            inside = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
-            found: dict[str, np.ndarray] = {}
-            for field, words in _FIELDS.items():
-                word = next((w for w in words if w in inside), None)
-                if word is not None:
-                    found[field] = _read_member(archive, inside[word], path)
-    except OSError:
-        raise
-    except (
-        zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, ValueError,
-        NotImplementedError, OverflowError, AttributeError, TypeError,
-    ) as e:  # fmt: skip
-        raise InputError("a whole .npz archive", source=path, field="byte 0") from e
-    if "positions" not in found:
-        raise InputError("an array called `positions`", source=path, value=list(inside))
-    names = None
-    if "names" in found:
-        raw = found["names"]
-        short = raw.dtype.itemsize <= 4 * _MAX_NAME
-        if raw.dtype.kind not in "US" or raw.ndim != 1 or not short:
-            raise InputError(
-                f"a list of names, each at most {_MAX_NAME} characters long",
-                source=path,
-                field="names",
-            )
-        names = [
-            n.decode("utf-8", "replace") if isinstance(n, bytes) else str(n)
-            for n in raw.tolist()
-        ]
-    rate = None
-    if "rate" in found:
-        if found["rate"].size != 1 or found["rate"].dtype.kind not in "fiu":
-            raise InputError("a number [Hz]", source=path, field="rate")
-        rate = float(found["rate"].ravel()[0])
-    return found["positions"], names, rate
-
-
-def _read_member(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path
-) -> np.ndarray:
-    """One array of the archive; never more bytes than are fair for its size."""
-    most = _RATIO * info.compress_size + _SLACK
-    if info.file_size > most:
-        raise InputError(
-            f"an array of at most {_RATIO} times its packed size "
-            f"({info.compress_size} bytes)",
-            source=path,
-            field=info.filename,
-            value=info.file_size,
-        )
-    with archive.open(info) as packed:
-        content = packed.read(most)
-    return _read_npy(io.BytesIO(content), len(content), path, info.filename)
+def _fault(error: BaseException) -> str:
+    """What NumPy says of a file, on one line."""
+    return " ".join(str(error).split())[:80] or type(error).__name__

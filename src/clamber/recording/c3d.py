@@ -1,6 +1,6 @@
 """C3D, the exchange format of motion capture: 512-byte blocks, parameters, samples.
 
-Read and written here rather than through `ezc3d`: that library holds each marker of
+Read here rather than through `ezc3d`: that library holds each marker of
 each sample as an object and trusts the counts in the file (see docs/recordings.md).
 The tests compare both on the same files.
 
@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from clamber.errors import InputError
-from clamber.recording.demonstration import Demonstration
 from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
 
 KEY = 0x50  # second byte of every C3D file
@@ -290,103 +289,3 @@ def _up(parameters: _Parameters) -> str | None:
     words = _words(parameters, "Y_SCREEN")
     axis = words[0].strip().lower().lstrip("+-") if words else ""
     return axis if axis in ("x", "y", "z") else None
-
-
-def write_c3d(demo: Demonstration, path: str | Path) -> None:
-    """Write a demonstration's points as C3D: millimetres, floats, z up.
-
-    Opens in Mokka, OpenSim and Visual3D. The boxes are not part of the file:
-    `recording.yaml` names them.
-
-    Args:
-        demo: What to write; long gaps stay gaps, short ones are as filled.
-        path: The file.
-
-    Raises:
-        InputError: It cannot be written.
-    """
-    n, f = len(demo.t), len(demo.names)
-    samples = np.zeros((n, f, 4), dtype="<f4")
-    samples[..., :3] = np.where(demo.valid[..., None], 1000.0 * demo.position, 0.0)
-    samples[..., 3] = np.where(demo.valid, 0.0, -1.0)
-
-    def build(start: int) -> bytes:
-        return _parameter_section(demo, start)
-
-    blocks = len(build(0)) // _BLOCK
-    start = 2 + blocks
-    last = min(n, 65535)
-    header = struct.pack(
-        "<BBHHHHHfHHf", 2, KEY, f, 0, 1, last, 0, -1.0, start, 1, demo.rate
-    )
-    body = samples.tobytes()
-    padding = b"\0" * (-len(body) % _BLOCK)
-    try:
-        with Path(path).open("wb") as file:
-            file.write(header.ljust(_BLOCK, b"\0") + build(start) + body + padding)
-    except OSError as e:
-        raise InputError(f"a file to write ({e.strerror})", source=path) from e
-
-
-def _parameter_section(demo: Demonstration, start: int) -> bytes:
-    """Groups and parameters, whole blocks."""
-    n, names = len(demo.t), demo.names
-    halves = [1, 0, n & 0xFFFF, n >> 16]
-    groups = {
-        "POINT": {
-            "USED": _shorts(len(names)),
-            "SCALE": _floats(-1.0),
-            "RATE": _floats(demo.rate),
-            "DATA_START": _shorts(start),
-            "FRAMES": _shorts(min(n, 65535)),
-            "LABELS": _strings(names),
-            "DESCRIPTIONS": _strings([""] * len(names)),
-            "UNITS": _strings(["mm"], flat=True),
-            "X_SCREEN": _strings(["+X"], flat=True),
-            "Y_SCREEN": _strings(["+Z"], flat=True),
-        },
-        "ANALOG": {
-            "USED": _shorts(0),
-            "LABELS": _strings([]),
-            "DESCRIPTIONS": _strings([]),
-            "GEN_SCALE": _floats(1.0),
-            "SCALE": struct.pack("<bBB", 4, 1, 0),
-            "OFFSET": struct.pack("<bBB", 2, 1, 0),
-            "UNITS": _strings([]),
-            "RATE": _floats(demo.rate),
-        },
-        "FORCE_PLATFORM": {"USED": _shorts(0)},
-        "TRIAL": {
-            "ACTUAL_START_FIELD": struct.pack("<bBB2H", 2, 1, 2, *halves[:2]),
-            "ACTUAL_END_FIELD": struct.pack("<bBB2H", 2, 1, 2, *halves[2:]),
-        },
-        "MANUFACTURER": {"SOFTWARE": _strings(["clamber"], flat=True)},
-    }
-    out = b""
-    for k, (group, parameters) in enumerate(groups.items(), start=1):
-        out += struct.pack("<bb", len(group), -k) + group.encode()
-        out += struct.pack("<hB", 3, 0)
-        for name, value in parameters.items():
-            out += struct.pack("<bb", len(name), k) + name.encode()
-            out += struct.pack("<h", 2 + len(value) + 1) + value + b"\0"
-    blocks = -(-(4 + len(out) + 2) // _BLOCK)
-    return (struct.pack("<BBBB", 1, KEY, blocks, _INTEL) + out).ljust(
-        blocks * _BLOCK, b"\0"
-    )
-
-
-def _shorts(value: int) -> bytes:
-    return struct.pack("<bBH", 2, 0, value)
-
-
-def _floats(value: float) -> bytes:
-    return struct.pack("<bBf", 4, 0, value)
-
-
-def _strings(words: list[str] | tuple[str, ...], flat: bool = False) -> bytes:
-    """Strings of equal width; `flat` is one string of one dimension."""
-    raw = [w.encode("latin-1", "replace")[:127] for w in words]
-    width = max([len(w) for w in raw], default=0)
-    sizes = [width] if flat else [width, len(raw)]
-    head = struct.pack(f"<bB{len(sizes)}B", -1, len(sizes), *sizes)
-    return head + b"".join(w.ljust(width) for w in raw)

@@ -10,14 +10,14 @@ Shapes: T samples, F points.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
 
 from clamber.contact.contact import PARTS
 from clamber.errors import InputError
-from clamber.model.scene import Scene
+from clamber.model.scene import Box, Scene, Support
 
 SIDES = ("L", "R")
 LANDMARKS = ("LShoulder", "RShoulder", "LHip", "RHip", "Pelvis")
@@ -27,7 +27,7 @@ MAX_SEGMENT = 3.0  # [m] a longer thigh is a wrong unit
 MIN_SEGMENT = 0.02  # [m] so is a shorter one
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Gap:
     """A stretch from `t0` to `t1` [s] in which a point was not seen."""
 
@@ -102,71 +102,75 @@ class Demonstration:
         return (part, *more)
 
 
-def build_demonstration(
-    raw: np.ndarray,
-    *,
-    names: Sequence[str],
-    rate: float,
-    scene: Scene,
-    source: str,
-    synthetic: bool = False,
-    t0: float = 0.0,
-    max_gap: float = MAX_GAP,
-    offsets: Mapping[str, float] | None = None,
-    raised: Mapping[str, float] | None = None,
-    notes: tuple[str, ...] = (),
-) -> Demonstration:
-    """Fill short gaps, mark long ones and measure the person.
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class RawTracks:
+    """Points of a person as they were seen, gaps and all.
 
-    Args:
-        raw: (T, F, 3) positions [m], z up, ground at z = 0; NaN where not seen.
-        names: F canonical names.
+    Attributes:
+        source: Where they came from.
+        synthetic: Whether a program made them.
+        names: (F,) canonical names.
+        position: (T, F, 3) [m], z up, ground at z = 0; NaN where not seen.
         rate: Samples per second [Hz].
-        scene: In the same coordinates.
-        source: Where it came from.
-        synthetic: Whether a program made it.
         t0: Time of the first sample [s].
+        scene: In the same coordinates.
         max_gap: Longest gap to fill by interpolation [s].
         offsets: In place of those estimated, by kind of point [m].
         raised: Added to those estimated, by kind of point [m].
         notes: What was recognised and assumed on the way here.
+    """
+
+    source: str
+    synthetic: bool = False
+    names: tuple[str, ...]
+    position: np.ndarray
+    rate: float
+    t0: float = 0.0
+    scene: Scene
+    max_gap: float = MAX_GAP
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    raised: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def build_demonstration(tracks: RawTracks) -> Demonstration:
+    """Fill short gaps, mark long ones and measure the person.
 
     Raises:
         InputError: A needed point was never seen or the lengths are not metres.
     """
-    raw = np.asarray(raw, dtype=float)
-    t = t0 + np.arange(len(raw)) / rate
-    seen = np.all(np.isfinite(raw), axis=2)
-    never = [n for n, ok in zip(names, seen.any(axis=0), strict=True) if not ok]
-    if needed := [n for n in never if n in REQUIRED]:
-        raise InputError(
-            "at least one sample that is not NaN", source=source, field=needed[0]
-        )
-    keep = [i for i, n in enumerate(names) if n not in never]
-    names = tuple(names[i] for i in keep)
-    position, valid, gaps = _fill(t, raw[:, keep], names, max_gap)
-    subject = _measure(names, position, valid, scene)
+    raw = np.asarray(tracks.position, dtype=float)
+    t = tracks.t0 + np.arange(len(raw)) / tracks.rate
+    ever = np.isfinite(raw).all(axis=2).any(axis=0)
+    if needed := [
+        n for n, ok in zip(tracks.names, ever, strict=True) if not ok and n in REQUIRED
+    ]:
+        expected = "at least one sample that is not NaN"
+        raise InputError(expected, tracks.source, needed[0])
+    keep = np.flatnonzero(ever)
+    names = tuple(tracks.names[i] for i in keep)
+    position, valid, gaps = _fill(t, raw[:, keep], names, tracks.max_gap)
+    subject = _measure(names, position, valid, tracks.scene)
     thigh = subject["thigh"]
     if not MIN_SEGMENT < thigh < MAX_SEGMENT:
-        hint = "unit: mm" if thigh > 100 else "unit: cm" if thigh > 1 else "unit: m"
-        raise InputError(
+        unit = "mm" if thigh > 100 else "cm" if thigh > 1 else "m"
+        expected = (
             f"positions in metres: the thigh comes out {thigh:.4g} m long; "
-            f"is {hint} meant?",
-            source=source,
-            field="unit",
+            f"is unit: {unit} meant?"
         )
+        raise InputError(expected, tracks.source, "unit")
     return Demonstration(
-        source=source,
-        synthetic=synthetic,
+        source=tracks.source,
+        synthetic=tracks.synthetic,
         t=t,
         names=names,
         position=position,
         valid=valid,
-        scene=scene,
+        scene=tracks.scene,
         subject=subject,
         gaps=tuple(gaps),
-        offsets=estimate_offsets(subject, raised or {}) | dict(offsets or {}),
-        notes=(*notes, *_say_gaps(gaps)),
+        offsets=estimate_offsets(subject, tracks.raised) | dict(tracks.offsets),
+        notes=(*tracks.notes, *_say_gaps(gaps)),
     )
 
 
@@ -224,10 +228,10 @@ def _fill(
     valid = seen.copy()
     dt = t[1] - t[0]
     for f, name in enumerate(names):
-        missing = runs(~seen[:, f])
+        ok = seen[:, f]
+        missing = runs(~ok)
         if not missing:
             continue
-        ok = seen[:, f]
         if ok.sum() > 1:
             from scipy.interpolate import PchipInterpolator
 
@@ -240,9 +244,7 @@ def _fill(
             at_edge = i == 0 or j == len(t)
             filled = not at_edge and bool((j - i) * dt <= max_gap + 1e-9)
             valid[i:j, f] = filled
-            gaps.append(
-                Gap(point=name, t0=float(t[i]), t1=float(t[j - 1]), filled=filled)
-            )
+            gaps.append(Gap(name, float(t[i]), float(t[j - 1]), filled))
     gaps.sort(key=lambda g: (g.t0, g.point))
     return position, valid, gaps
 
@@ -298,12 +300,159 @@ def _measure(
         height = foot[:, 2] - floor
         ankle.append(height[height < 0.5 * subject["shank"]])
     heights = np.concatenate(ankle)
-    low = (
-        float(np.median(heights))
-        if len(heights)
-        else _ANKLE_PER_SHANK * subject["shank"]
-    )
+    low = _ANKLE_PER_SHANK * subject["shank"]
+    if len(heights):
+        low = float(np.median(heights))
     subject["ankle_height"] = low
     subject["knee_height"] = low + subject["shank"]
     subject["hip_height"] = low + subject["shank"] + subject["thigh"]
     return subject
+
+
+# In real takes the floor is off by centimetres: the origin was set on a plate, the
+# boxes were measured by hand. A foot that stands tells better, given how high its
+# joints are over the sole (`Demonstration.offsets`), and so does a knee that kneels.
+
+_EVIDENCE = ("Foot", "Knee", "Hand")
+_SEARCH = 0.10  # [m] no take is further off; more is another surface
+_SPEED = 0.10  # [m/s] slower is at rest
+_THIN = 1e-3  # [m] a box is never lowered to less
+_REST = 0.3  # [s] at least
+_SMOOTH = 0.2  # [s] length of the filter for speeds
+_UP = np.array([0.0, 0.0, 1.0])
+_SHANK_UP, _SHANK_LIES, _THIGH_UP = 0.6, 0.5, 0.1  # sines of slopes: stands; kneels
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """By how much a support was off.
+
+    Attributes:
+        support: Its name.
+        correction: To be added to its height [m].
+        part: What rested on it: feet, else knees, else hands.
+        seconds: For how long altogether.
+        spread: Half the range that holds the middle half of these seconds [m].
+    """
+
+    support: str
+    correction: float
+    part: str
+    seconds: float
+    spread: float
+
+
+def find_levels(demo: Demonstration) -> tuple[Level, ...]:
+    """Heights of the supports, from what rests on them; only those with evidence."""
+    out: list[Level] = []
+    for support in demo.scene.supports:
+        for part in _EVIDENCE:
+            both = [_resting(demo, s + part, support) for s in SIDES]
+            clearance = np.concatenate(both)
+            if len(clearance) >= _REST * demo.rate:
+                low, middle, high = np.percentile(clearance, [25, 50, 75])
+                seconds, spread = len(clearance) / demo.rate, float(high - low) / 2
+                out.append(Level(support.name, float(middle), part, seconds, spread))
+                break
+    return tuple(out)
+
+
+def fit_levels(demo: Demonstration) -> Demonstration:
+    """The same demonstration with floor and boxes where the person rests on them.
+
+    The ground stays z = 0, so that the person is moved instead; a box that nobody
+    rests on keeps its height over the ground. What was done is in the notes.
+    """
+    levels = {x.support: x for x in find_levels(demo)}
+    ground = demo.scene.supports[0].name
+    lift = levels[ground].correction if ground in levels else 0.0
+    position = demo.position.copy()
+    position[..., 2] -= lift
+    boxes = tuple(
+        _raised(b, levels[b.name].correction - lift) if b.name in levels else b
+        for b in demo.scene.boxes
+    )
+    notes = [
+        f"fitted: {name} {1000 * x.correction:+.0f} mm ({x.part.lower()} at rest for "
+        f"{x.seconds:.1f} s, spread {1000 * x.spread:.0f} mm)"
+        for name, x in levels.items()
+    ]
+    unknown = [s.name for s in demo.scene.supports if s.name not in levels]
+    notes += [f"not fitted: {n}, nothing rests on it" for n in unknown]
+    return replace(
+        demo,
+        position=position,
+        scene=replace(demo.scene, boxes=boxes),
+        notes=(*demo.notes, *notes),
+    )
+
+
+def _raised(box: Box, lift: float) -> Box:
+    """The box with its top higher; its foot stays, unless it is tilted."""
+    if abs(box.rotation[2, 2]) < 1 - 1e-9:
+        return replace(box, position=box.position + lift * _UP)
+    lift = max(lift, _THIN - box.size[2])
+    size = box.size + lift * _UP
+    return replace(box, size=size, position=box.position + lift / 2 * _UP)
+
+
+def _resting(demo: Demonstration, part: str, support: Support) -> np.ndarray:
+    """(N,) clearances [m] of a part, sample by sample, at rest."""
+    point = _telling(demo, part)
+    if point is None or point[1:] not in demo.offsets:
+        return np.empty(0)
+    p, seen = demo.point(point), demo.valid[:, demo.names.index(point)]
+    clearance = support.height(p) - demo.offsets[point[1:]]
+    ok = seen & (np.abs(clearance) < _SEARCH) & support.inside(p)
+    ok &= ~_covered(demo.scene, support, p, clearance)
+    ok &= _in_support(demo, part) & (_speed(demo, point) < _SPEED)
+    shortest = _REST * demo.rate
+    kept = [clearance[i:j] for i, j in runs(ok) if j - i >= shortest]
+    return np.concatenate(kept) if kept else np.empty(0)
+
+
+def _telling(demo: Demonstration, part: str) -> str | None:
+    """The point whose height tells: toe, knee or knuckle; a wrist tells nothing."""
+    best = {"Foot": part + ".toe", "Hand": part + ".knuckle"}.get(part[1:], part)
+    if best in demo.names:
+        return best
+    return None if part[1:] == "Hand" else part
+
+
+def _covered(
+    scene: Scene, support: Support, p: np.ndarray, clearance: np.ndarray
+) -> np.ndarray:
+    """(T,) whether another support lies between, or rather explains the height."""
+    out = np.zeros(len(p), dtype=bool)
+    for other in scene.supports:
+        if other.name != support.name:
+            gap = support.height(p) - other.height(p)
+            out |= other.inside(p) & (gap > 0) & (clearance - gap > -_SEARCH)
+    return out
+
+
+def _in_support(demo: Demonstration, part: str) -> np.ndarray:
+    """(T,) whether the leg stands, or kneels; of other parts always."""
+    side, kind = part[0], part[1:]
+    hip, knee, ankle = (demo.point(side + j)[:, 2] for j in ("Hip", "Knee", "Foot"))
+    rise = (knee - ankle) / demo.subject["shank"]
+    if kind == "Foot":
+        return rise > _SHANK_UP
+    if kind == "Knee":
+        return (rise < _SHANK_LIES) & (hip - knee > _THIGH_UP * demo.subject["thigh"])
+    return np.ones(len(demo.t), dtype=bool)
+
+
+def _speed(demo: Demonstration, point: str) -> np.ndarray:
+    """(T,) of a point [m/s]."""
+    from scipy.signal import savgol_filter
+
+    n = min(
+        max(5, 2 * round(_SMOOTH * demo.rate / 2) + 1), (len(demo.t) - 1) // 2 * 2 + 1
+    )
+    if n < 5:
+        return np.full(len(demo.t), np.inf)  # too short to tell rest from motion
+    velocity = savgol_filter(
+        demo.point(point), n, 2, deriv=1, delta=1.0 / demo.rate, axis=0
+    )
+    return np.linalg.norm(np.asarray(velocity), axis=1)

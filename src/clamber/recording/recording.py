@@ -1,7 +1,8 @@
 """From any recording's file, with or without a `recording.yaml`, to a Demonstration.
 
 The readers say what is in a file; here it is decided what that means: which format it
-is, what the names are, which unit and which axis, and what of it becomes the record.
+is, what the names are, which unit and which axis, which box is the ground, and what of
+it becomes the record.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,24 +21,25 @@ import pydantic
 from clamber.errors import InputError, read_yaml, unreadable, validated
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_quat
-from clamber.model.terrain import load_scene, to_z_up
+from clamber.model.terrain import load_scene, read_obj, to_z_up
 from clamber.recording import arrays, bvh, c3d, motive, trc
-from clamber.recording.boxes import FLOOR, lower_to_ground, read_obj_boxes
+from clamber.recording.built_in import BUILT_IN, load_built_in
 from clamber.recording.demonstration import (
     MAX_GAP,
     SIDES,
     Demonstration,
+    RawTracks,
     build_demonstration,
+    fit_levels,
 )
-from clamber.recording.levels import fit_levels
-from clamber.recording.marker_sets import (
+from clamber.recording.points import MAX_RATE, METRES, Points, read_safely
+from clamber.recording.skeleton import (
     Recognised,
     known_point,
     median_length,
     recognise,
     solve_centres,
 )
-from clamber.recording.points import MAX_RATE, METRES, Points, read_safely
 
 Rate = Annotated[float, pydantic.Field(gt=0.0, le=MAX_RATE, allow_inf_nan=False)]
 Seconds = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
@@ -54,6 +57,8 @@ _READERS: tuple[tuple[tuple[str, ...], int, bytes, Callable[[Path], Points]], ..
     ((".npz",), 0, arrays.NPZ_MAGIC, arrays.read_array),
 )
 YAML = (".yaml", ".yml")
+FLOOR = "floor"
+_THIN = 1e-3  # [m] what rises less above the ground is part of it
 SUFFIXES = (*YAML, *(s for suffixes, *_ in _READERS for s in suffixes))
 
 
@@ -121,8 +126,8 @@ class RecordingFile(pydantic.BaseModel):
         return offsets
 
 
-def load_recording(
-    path: Path,
+def load_demo(
+    path_or_name: str | Path,
     *,
     scene: Scene | None = None,
     names: str | Path | Sequence[str] | None = None,
@@ -130,22 +135,43 @@ def load_recording(
     span: tuple[float, float] | None = None,
     fit_floor: bool = False,
 ) -> Demonstration:
-    """Read a recording: a file of any known format, or the `recording.yaml` of one.
+    """Read a recording, or take a built-in one by its name.
+
+    Args:
+        path_or_name: `climb` or `crossing` for a built-in synthetic one, a
+            `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, or an array
+            (`.npy`, or `.npz` with `positions`, `names` and `rate`).
+        scene: Replaces the boxes of the recording, in its coordinates.
+        names: Of the columns of a bare array: a list, or a JSON file with one.
+        rate: Of a bare array, or in place of the file's own [Hz].
+        span: Part of the recording to keep [s]; of a `recording.yaml`, its own by
+            default.
+        fit_floor: Correct the heights of floor and boxes by what rests on them.
 
     Raises:
-        InputError: The file, or one that it names, or one of its fields, cannot be
-            used.
+        InputError: The name is unknown, or the file, or one that it names, or a field
+            cannot be used.
     """
-    if path.suffix.lower() in YAML:
-        given = read_yaml(path)
-    else:
-        if names is not None and not isinstance(names, (str, Path)):
-            listed: str | list[str] | None = list(names)
+    path = Path(path_or_name)
+    if str(path_or_name) in BUILT_IN:
+        demo = load_built_in(str(path_or_name))
+    elif path.suffix.lower() in SUFFIXES or path.is_file():
+        if path.suffix.lower() in YAML:
+            given = read_yaml(path)
         else:
-            listed = None if names is None else str(Path(names).absolute())
-        given = {"file": path.name, "names": listed, "rate": rate}
-    said = validated(RecordingFile, given, path)
-    demo = _build(path, said, scene=scene, span=span or said.span)
+            if isinstance(names, (str, Path)):
+                names = str(Path(names).absolute())
+            elif names is not None:
+                names = list(names)
+            given = {"file": path.name, "names": names, "rate": rate}
+        said = validated(RecordingFile, given, path)
+        demo = _build(path, said, scene, span or said.span)
+    else:
+        expected = (
+            f"one of the built-in demonstrations {list(BUILT_IN)} or a file "
+            f"that ends in {', '.join(SUFFIXES)}"
+        )
+        raise InputError(expected, "recording", value=str(path_or_name))
     return fit_levels(demo) if fit_floor else demo
 
 
@@ -177,23 +203,17 @@ def read_points(
     certain = [r for r in by_content if r is not c3d.read_c3d or r in by_suffix]
     reader = next(iter([*certain, *by_suffix]), None)
     if reader is None:
-        raise InputError(
-            f"a recording: {', '.join(s for s in SUFFIXES if s not in YAML)}",
-            source=path,
-        )
+        kinds = ", ".join(s for s in SUFFIXES if s not in YAML)
+        raise InputError(f"a recording: {kinds}", path)
     if reader is arrays.read_array:
-        points = read_safely(
-            lambda p: arrays.read_array(p, names=names, rate=rate), path
-        )
-    else:
-        points = read_safely(reader, path)
+        reader = partial(arrays.read_array, names=names, rate=rate)
+    points = read_safely(reader, path)
     return points if rate is None else replace(points, rate=rate)
 
 
 def _build(
     path: Path,
     said: RecordingFile,
-    *,
     scene: Scene | None,
     span: tuple[float, float] | None,
 ) -> Demonstration:
@@ -228,26 +248,26 @@ def _build(
     position = np.stack(list(solved.values()), axis=1)
 
     given = _boxes(said, folder, unit, up) if scene is None else scene
-    boxes, level = lower_to_ground(list(given.boxes), said.ground, path)
+    boxes, level = lower_to_ground(given.boxes, said.ground, path)
     position[..., 2] -= level
-    placed = replace(
-        given, boxes=boxes, start=_start(position, list(solved)), goal=None
-    )
+    start = _start(position, list(solved))
     return build_demonstration(
-        position,
-        names=list(solved),
-        rate=points.rate,
-        scene=placed,
-        source=str(path),
-        t0=first / points.rate,
-        max_gap=said.max_gap,
-        offsets=said.offsets,
-        raised=found.raised,
-        notes=(
-            f"recognised: {found.name} ({len(points.names)} points at "
-            f"{points.rate:g} Hz)",
-            f"unit: {unit:g} m ({why_unit}); up: {up} ({why_up})",
-        ),
+        RawTracks(
+            source=str(path),
+            names=tuple(solved),
+            position=position,
+            rate=points.rate,
+            t0=first / points.rate,
+            scene=replace(given, boxes=boxes, start=start, goal=None),
+            max_gap=said.max_gap,
+            offsets=said.offsets or {},
+            raised=found.raised,
+            notes=(
+                f"recognised: {found.name} ({len(points.names)} points at "
+                f"{points.rate:g} Hz)",
+                f"unit: {unit:g} m ({why_unit}); up: {up} ({why_up})",
+            ),
+        )
     )
 
 
@@ -302,12 +322,11 @@ def _unit(
     for name, unit in _GUESSES.items():
         if _SHANK[0] <= shank * unit <= _SHANK[1]:
             return unit, f"the shank is {shank:.4g} long, so these are {name}"
-    raise InputError(
-        f"the unit of length (m, cm, mm or metres per unit): the shank is {shank:.4g} "
-        "units long",
-        source=path,
-        field="unit",
+    expected = (
+        "the unit of length (m, cm, mm or metres per unit): the shank is "
+        f"{shank:.4g} units long"
     )
+    raise InputError(expected, path, "unit")
 
 
 _UPRIGHT = 0.85  # of the length from ankles over knees and hips to shoulders: it stands
@@ -349,12 +368,8 @@ def _up(
 def _fixed(points: Points, what: FixedPoint, unit: float, path: Path) -> np.ndarray:
     """(T, 3) of a point fixed to a body, in the file's unit and axes."""
     if what.body not in points.orientation:
-        raise InputError(
-            f"a rigid body or bone with rotations: {sorted(points.orientation)}",
-            source=path,
-            field="parts: body",
-            value=what.body,
-        )
+        known = f"a rigid body or bone with rotations: {sorted(points.orientation)}"
+        raise InputError(known, path, "parts: body", what.body)
     quaternion = points.orientation[what.body]
     length = np.linalg.norm(quaternion, axis=1, keepdims=True)
     R = matrix_from_quat(quaternion / np.where(length > 0, length, np.nan))
@@ -371,10 +386,10 @@ def _read_names(names: str | list[str], folder: Path, source: Path) -> list[str]
         except OSError as e:
             raise unreadable(path, e) from e
         except (ValueError, RecursionError) as e:
-            raise InputError("a JSON list of names", source=path) from e
+            raise InputError("a JSON list of names", path) from e
         source = path
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
-        raise InputError("a list of names", source=source, field="names")
+        raise InputError("a list of names", source, "names")
     return names
 
 
@@ -388,26 +403,21 @@ def _span(
     first = int(np.ceil(min(span[0], end + 1.0) * rate - 1e-6))
     last = min(int(np.floor(min(span[1], end) * rate + 1e-6)) + 1, n)
     if span[0] < 0 or last - first < 2:
-        raise InputError(
-            f"a stretch between 0 and {end:.2f} s with at least two samples",
-            source=source,
-            field="span",
-            value=list(span),
-        )
+        expected = f"a stretch between 0 and {end:.2f} s with at least two samples"
+        raise InputError(expected, source, "span", list(span))
     return first, last
 
 
 def _boxes(said: RecordingFile, folder: Path, unit: float, up: str) -> Scene:
     """The scene that `boxes` names, without a start of its own yet."""
-    boxes: list[Box] = []
-    if said.boxes is not None:
-        path = folder / said.boxes
-        if path.suffix.lower() in YAML:
-            return load_scene(path)
-        if path.suffix.lower() != ".obj":
-            raise InputError("an .obj or a scene.yaml", source=path, field="boxes")
-        boxes = read_obj_boxes(path, unit, up)
-    return Scene(boxes=tuple(boxes), start=np.zeros(3))
+    if said.boxes is None:
+        return Scene(start=np.zeros(3))
+    path = folder / said.boxes
+    if path.suffix.lower() in YAML:
+        return load_scene(path)
+    if path.suffix.lower() != ".obj":
+        raise InputError("an .obj or a scene.yaml", path, "boxes")
+    return Scene(boxes=tuple(read_obj(path, unit, up)), start=np.zeros(3))
 
 
 def _start(raw: np.ndarray, points: list[str]) -> np.ndarray:
@@ -420,3 +430,34 @@ def _start(raw: np.ndarray, points: list[str]) -> np.ndarray:
     middle = (first["LFoot"] + first["RFoot"]) / 2
     left = first["LHip"] - first["RHip"]
     return np.array([middle[0], middle[1], np.arctan2(-left[0], left[1])])
+
+
+def lower_to_ground(
+    boxes: Sequence[Box], ground: str, source: object
+) -> tuple[tuple[Box, ...], float]:
+    """What remains of the boxes over the chosen ground, and the height it had [m].
+
+    Raises:
+        InputError: No box has that name.
+    """
+    names = [b.name for b in boxes]
+    if ground == FLOOR:
+        level = 0.0
+    elif ground in names:
+        level = float(boxes[names.index(ground)].top.position[2])
+    else:
+        expected = f"{FLOOR} or one of the boxes {names}"
+        raise InputError(expected, source, "ground", ground)
+    kept = []
+    for b in boxes:
+        top = float(b.top.position[2]) - level
+        if b.name == ground or top < _THIN:
+            continue
+        if abs(b.rotation[2, 2]) < 1 - 1e-9:  # a tilted box is lowered, never cut
+            kept.append(replace(b, position=b.position - [0.0, 0.0, level]))
+            continue
+        bottom = max(float(b.position[2] - b.size[2] / 2) - level, 0.0)
+        size = np.array([b.size[0], b.size[1], top - bottom])
+        centre = np.array([b.position[0], b.position[1], (top + bottom) / 2])
+        kept.append(replace(b, size=size, position=centre))
+    return tuple(kept), level

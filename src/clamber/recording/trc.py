@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from clamber.errors import InputError
-from clamber.recording.demonstration import Demonstration
 from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
 from clamber.recording.table import check_count, place_rows, read_blocks
 
@@ -89,41 +88,3 @@ def _number(said: dict[str, str], key: str, path: Path) -> float:
         raise InputError(
             f"`{key}` with a number below it", source=path, field="line 3", value=text
         ) from e
-
-
-def write_trc(demo: Demonstration, path: str | Path) -> None:
-    """Write a demonstration's points as TRC: millimetres, y up, gaps as empty cells.
-
-    Opens in OpenSim. The boxes are not part of the file: `recording.yaml` names them.
-
-    Args:
-        demo: What to write; long gaps stay gaps, short ones are as filled.
-        path: The file.
-
-    Raises:
-        InputError: It cannot be written.
-    """
-    path = Path(path)
-    rate, n, f = demo.rate, len(demo.t), len(demo.names)
-    heading = (
-        f"PathFileType\t4\t(X/Y/Z)\t{path.name}\n"
-        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\t"
-        "OrigDataStartFrame\tOrigNumFrames\n"
-        f"{rate:.10g}\t{rate:.10g}\t{n}\t{f}\tmm\t{rate:.10g}\t1\t{n}\n"
-        + "Frame#\tTime\t" + "\t\t\t".join(demo.names) + "\t\t\n"
-        + "\t\t" + "\t".join(f"{a}{k}" for k in range(1, f + 1) for a in "XYZ") + "\n"
-        + "\n"
-    )  # fmt: skip
-    p = 1000.0 * demo.position
-    p = np.stack([p[..., 0], p[..., 2], -p[..., 1]], axis=-1)
-    try:
-        with path.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(heading)
-            for k, (t, row, seen) in enumerate(zip(demo.t, p, demo.valid, strict=True)):
-                cells = [
-                    f"{x:.4f}\t{y:.4f}\t{z:.4f}" if ok else "\t\t"
-                    for (x, y, z), ok in zip(row.tolist(), seen, strict=True)
-                ]
-                file.write(f"{k + 1}\t{t:.6f}\t" + "\t".join(cells) + "\n")
-    except OSError as e:
-        raise InputError(f"a file to write ({e.strerror})", source=path) from e

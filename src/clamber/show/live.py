@@ -17,8 +17,9 @@ from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
+from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
-from clamber.recording.library import BUILT_IN, load_demo
+from clamber.recording.recording import load_demo
 from clamber.run.folder import PLAN, SEQUENCE, load_sequence
 from clamber.show.editor import Editor
 from clamber.show.edits import paired_times

@@ -31,7 +31,7 @@ from clamber.planning.planner import plan
 from clamber.planning.records import Method, Plan, PlanOptions
 from clamber.planning.substitutes import plan_or_replan
 from clamber.recording.detect import detect_contacts
-from clamber.recording.library import load_demo
+from clamber.recording.recording import load_demo
 
 Contacts = Literal["any", "demonstrated"]
 

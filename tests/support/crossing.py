@@ -30,8 +30,13 @@ from clamber.model.se3 import (
     quat_from_matrix,
     rotation_vector,
 )
-from clamber.recording.demonstration import SIDES, Demonstration, build_demonstration
-from clamber.recording.figure import (
+from clamber.recording.demonstration import (
+    SIDES,
+    Demonstration,
+    RawTracks,
+    build_demonstration,
+)
+from support.figure import (
     ANKLE,
     ELBOW,
     FOOT,
@@ -113,17 +118,18 @@ def synthesize_crossing(
         The recording and its true contacts by start time.
     """
     o = options or CrossingOptions()
-    phases = _script(o)
-    tracks, truth = _perform(rng, o, phases)
+    tracks, truth = clean_motion(rng, o)
     if o.mirrored:
         tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
     demo = build_demonstration(
-        corrupt(tracks, rng, noise=o.noise, gaps=o.gaps, rate=o.rate),
-        names=tuple(tracks),
-        rate=o.rate,
-        scene=_scene(o),
-        source=f"built-in crossing, synthetic (noise {1e3 * o.noise:g} mm)",
-        synthetic=True,
+        RawTracks(
+            source=f"built-in crossing, synthetic (noise {1e3 * o.noise:g} mm)",
+            synthetic=True,
+            names=tuple(tracks),
+            position=corrupt(tracks, rng, o.noise, o.gaps, o.rate),
+            rate=o.rate,
+            scene=_scene(o),
+        )
     )
     return demo, sorted(truth, key=lambda i: (i.t0, i.part))
 
@@ -475,10 +481,11 @@ def _climb_down(script: _Script, f: _Frame) -> None:
 # The motion.
 
 
-def _perform(
-    rng: np.random.Generator, o: CrossingOptions, phases: list[_Phase]
+def clean_motion(
+    rng: np.random.Generator, o: CrossingOptions
 ) -> tuple[Tracks, list[ContactInterval]]:
-    """Exact tracks (T, 3) and true contacts of a script."""
+    """Exact tracks (T, 3) and true contacts; the left side goes first."""
+    phases = _script(o)
     lasts = np.array([0.0, *(p.seconds for p in phases)]) / o.speed
     at = np.cumsum(lasts)
     t = np.arange(int(at[-1] * o.rate) + 1) / o.rate

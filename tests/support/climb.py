@@ -19,8 +19,13 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactInterval
 from clamber.model.scene import GROUND, Box, Scene
 from clamber.model.se3 import frame_from_normal, quat_from_matrix
-from clamber.recording.demonstration import SIDES, Demonstration, build_demonstration
-from clamber.recording.figure import (
+from clamber.recording.demonstration import (
+    SIDES,
+    Demonstration,
+    RawTracks,
+    build_demonstration,
+)
+from support.figure import (
     ANKLE,
     ELBOW,
     FOOT,
@@ -134,20 +139,19 @@ def synthesize_climb(
         The recording and its true contacts by start time.
     """
     options = options or ClimbOptions()
-    tracks, truth = _clean_motion(rng, options)
+    tracks, truth = clean_motion(rng, options)
     if options.mirrored:
         tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
-    names = tuple(tracks)
-    raw = corrupt(
-        tracks, rng, noise=options.noise, gaps=options.gaps, rate=options.rate
-    )
+    raw = corrupt(tracks, rng, options.noise, options.gaps, options.rate)
     demo = build_demonstration(
-        raw,
-        names=names,
-        rate=options.rate,
-        scene=_scene(options),
-        source=f"built-in climb, synthetic (noise {1e3 * options.noise:g} mm)",
-        synthetic=True,
+        RawTracks(
+            source=f"built-in climb, synthetic (noise {1e3 * options.noise:g} mm)",
+            synthetic=True,
+            names=tuple(tracks),
+            position=raw,
+            rate=options.rate,
+            scene=_scene(options),
+        )
     )
     return demo, sorted(truth, key=lambda i: (i.t0, i.part))
 
@@ -290,7 +294,7 @@ def _orders(first: str) -> tuple[tuple[str, str], ...]:
     return (first, "first"), ("R" if first == "L" else "L", "second")
 
 
-def _clean_motion(
+def clean_motion(
     rng: np.random.Generator, o: ClimbOptions
 ) -> tuple[Tracks, list[ContactInterval]]:
     """Exact tracks (T, 3) and true contacts; the left side goes first."""

@@ -22,6 +22,7 @@ FOOT = 0.15  # [m] from ankle to toe along the sole
 KNEE_HEIGHT = ANKLE + SHANK
 # Heights [m] of a joint's centre over what its part rests on.
 WRIST, ELBOW, KNEE = 0.03, 0.05, 0.11
+SWAYS = 24  # numbers that `sway` draws
 REACH = 0.985  # of a limb's length: no one locks a loaded joint
 SIGN = {"L": 1.0, "R": -1.0}
 
@@ -200,13 +201,25 @@ def mirror_contact(i: ContactInterval) -> ContactInterval:
 
 
 def corrupt(
-    tracks: Tracks, rng: np.random.Generator, *, noise: float, gaps: int, rate: float
+    tracks: Tracks, rng: np.random.Generator, noise: float, gaps: int, rate: float
 ) -> np.ndarray:
     """Tracks (T, F, 3) as cameras see them: noisy [m], with short stretches missing."""
     raw = np.stack(list(tracks.values()), axis=1)
     raw += noise * rng.standard_normal(raw.shape)
-    for _ in range(gaps):
-        start = int(rng.integers(1, len(raw) - 30))
-        length = int(rng.integers(4, 20) * rate / 120.0)
-        raw[start : start + length, int(rng.integers(len(tracks)))] = np.nan
+    for first, count, point in draw_gaps(rng, gaps, rate, raw.shape):
+        raw[first : first + count, point] = np.nan
     return raw
+
+
+def draw_gaps(
+    rng: np.random.Generator, gaps: int, rate: float, shape: tuple[int, ...]
+) -> list[tuple[int, int, int]]:
+    """First sample, samples and point of each."""
+    return [
+        (
+            int(rng.integers(1, shape[0] - 30)),
+            int(rng.integers(4, 20) * rate / 120.0),
+            int(rng.integers(shape[1])),
+        )
+        for _ in range(gaps)
+    ]
