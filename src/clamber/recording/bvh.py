@@ -17,8 +17,13 @@ from typing import BinaryIO
 import numpy as np
 
 from clamber.errors import InputError
-from clamber.recording.points import MAX_POINTS, Points, unique_names
-from clamber.recording.table import check_count, read_blocks
+from clamber.recording.points import (
+    MAX_POINTS,
+    Points,
+    check_count,
+    read_table,
+    unique_names,
+)
 
 MAGIC = b"HIERARCHY"
 _LINE = 1 << 16  # [byte] a longer line of the hierarchy is none
@@ -49,15 +54,13 @@ def read_bvh(path: Path) -> Points:
         count, rate, line = _read_motion(file, path, line)
         blocks = [
             _positions(joints, rows[k : k + _FRAMES])
-            for rows in read_blocks(
-                file, columns=columns, delimiter=None, line=line, source=path
-            )
+            for rows in read_table(file, columns, None, line, path)
             for k in range(0, len(rows), _FRAMES)
         ]
     if not blocks:
-        raise InputError("rows of numbers", source=path, field=f"line {line}")
+        raise InputError("rows of numbers", path, f"line {line}")
     position = np.concatenate(blocks)
-    check_count(len(position), count, line=line, what="Frames", source=path)
+    check_count(len(position), count, line, "Frames", path)
     return Points(
         names=unique_names([j.name for j in joints]),
         position=position,
@@ -80,9 +83,8 @@ def _read_hierarchy(file: BinaryIO, path: Path) -> tuple[list[_Joint], int, int]
             case ["MOTION"] if not open_joints and joints:
                 return joints, columns, line
             case ["ROOT" | "JOINT", *name]:
-                joints.append(
-                    _Joint(" ".join(name).strip("{ "), _last(open_joints), _ZERO, [])
-                )
+                above = open_joints[-1] if open_joints else -1
+                joints.append(_Joint(" ".join(name).strip("{ "), above, _ZERO, []))
                 open_joints.append(len(joints) - 1)
             case ["End", *_] if open_joints:
                 end = f"{joints[open_joints[-1]].name}_end"
@@ -94,46 +96,32 @@ def _read_hierarchy(file: BinaryIO, path: Path) -> tuple[list[_Joint], int, int]
                 joints[open_joints[-1]].offset = _numbers(numbers, line, path)
             case ["CHANNELS", count, *kinds] if open_joints:
                 if not count.isdecimal() or int(count) != len(kinds):
-                    raise InputError(
-                        f"{count} channels", source=path, field=f"line {line}",
-                        value=len(kinds),
-                    )  # fmt: skip
+                    where = f"line {line}"
+                    raise InputError(f"{count} channels", path, where, len(kinds))
                 for kind in kinds:
-                    joints[open_joints[-1]].channels.append(
-                        _channel(kind, columns, line, path)
-                    )
+                    channel = _channel(kind, columns, line, path)
+                    joints[open_joints[-1]].channels.append(channel)
                     columns += 1
             case _:
-                raise InputError(
+                expected = (
                     "HIERARCHY, ROOT, JOINT, End Site, OFFSET x y z, CHANNELS, "
-                    "braces in pairs, then MOTION",
-                    source=path,
-                    field=f"line {line}",
-                    value=" ".join(words)[:40],
+                    "braces in pairs, then MOTION"
                 )
+                found = " ".join(words)[:40]
+                raise InputError(expected, path, f"line {line}", found)
         if max(len(joints), columns // 6) > MAX_POINTS:
-            raise InputError(
-                f"at most {MAX_POINTS} joints", source=path, field=f"line {line}"
-            )
-    raise InputError("MOTION", source=path, field=f"line {line + 1}")
+            raise InputError(f"at most {MAX_POINTS} joints", path, f"line {line}")
+    raise InputError("MOTION", path, f"line {line + 1}")
 
 
 _ZERO = np.zeros(3)
 
 
-def _last(open_joints: list[int]) -> int:
-    return open_joints[-1] if open_joints else -1
-
-
 def _channel(kind: str, column: int, line: int, path: Path) -> tuple[str, int, int]:
     axis, what = "XYZ".find(kind[:1].upper()), kind[1:].lower()
     if axis < 0 or what not in ("position", "rotation"):
-        raise InputError(
-            "channels such as Xposition or Zrotation",
-            source=path,
-            field=f"line {line}",
-            value=kind[:40],
-        )
+        expected = "channels such as Xposition or Zrotation"
+        raise InputError(expected, path, f"line {line}", kind[:40])
     return what, axis, column
 
 
@@ -143,9 +131,7 @@ def _numbers(words: list[str], line: int, path: Path) -> np.ndarray:
     except ValueError:
         x = np.array([np.nan])
     if not np.isfinite(x).all():
-        raise InputError(
-            f"{len(words)} finite numbers", source=path, field=f"line {line}"
-        )
+        raise InputError(f"{len(words)} finite numbers", path, f"line {line}")
     return x
 
 
@@ -158,16 +144,12 @@ def _read_motion(file: BinaryIO, path: Path, line: int) -> tuple[float, float, i
             text, line = file.readline(_LINE), line + 1
         plain = " ".join(text.decode("utf-8", "replace").split())
         if not plain.lower().startswith(key.lower()):
-            raise InputError(
-                f"`{key}` and a number", source=path, field=f"line {line}",
-                value=plain[:40],
-            )  # fmt: skip
+            expected = f"`{key}` and a number"
+            raise InputError(expected, path, f"line {line}", plain[:40])
         said.append(float(_numbers([plain[len(key) :]], line, path)[0]))
     count, step = said
     if not step > 0.0:
-        raise InputError(
-            "a positive frame time", source=path, field=f"line {line}", value=step
-        )
+        raise InputError("a positive frame time", path, f"line {line}", step)
     return count, 1.0 / step, line + 1
 
 
@@ -179,7 +161,7 @@ def _positions(joints: list[_Joint], rows: np.ndarray) -> np.ndarray:
     n = len(rows)
     out = np.empty((n, len(joints), 3))
     rotation: list[np.ndarray | None] = []  # (3, 3, N); None where it is never needed
-    bears = {j.parent for j in joints}
+    parents = {j.parent for j in joints}
     for k, joint in enumerate(joints):
         moved = np.repeat(joint.offset[:, None], n, axis=1)
         for what, axis, column in joint.channels:
@@ -189,7 +171,7 @@ def _positions(joints: list[_Joint], rows: np.ndarray) -> np.ndarray:
         if above is not None:
             moved = np.sum(above * moved, axis=1) + out[:, joint.parent].T
         out[:, k] = moved.T
-        rotation.append(_turned(above, joint, rows) if k in bears else None)
+        rotation.append(_turned(above, joint, rows) if k in parents else None)
     return out
 
 

@@ -36,25 +36,16 @@ def read_c3d(path: Path) -> Points:
     """
     content = np.fromfile(path, dtype=np.uint8)
     if len(content) < 2 * _BLOCK or content[1] != KEY:
-        raise InputError(
-            f"a C3D file: at least {2 * _BLOCK} bytes, the second one {KEY:#x}",
-            source=path,
-            field="byte 1",
-        )
+        expected = f"a C3D file: at least {2 * _BLOCK} bytes, the second one {KEY:#x}"
+        raise InputError(expected, path, "byte 1")
     start = (int(content[0]) - 1) * _BLOCK
     if not _BLOCK <= start <= len(content) - 4:
-        raise InputError(
-            "the number of the block where parameters begin", source=path,
-            field="byte 0", value=int(content[0]),
-        )  # fmt: skip
+        expected = "the number of the block where parameters begin"
+        raise InputError(expected, path, "byte 0", int(content[0]))
     processor = int(content[start + 3])
     if processor not in (_INTEL, _DEC, _MIPS):
-        raise InputError(
-            f"processor {_INTEL}, {_DEC} or {_MIPS}",
-            source=path,
-            field=f"byte {start + 3}",
-            value=processor,
-        )
+        expected = f"processor {_INTEL}, {_DEC} or {_MIPS}"
+        raise InputError(expected, path, f"byte {start + 3}", processor)
     parameters = _read_parameters(content, start, processor, path)
     header = _Header.read(content, parameters, processor, path)
     position = _read_samples(content, header, processor, path)
@@ -97,17 +88,13 @@ def _read_parameters(
     order = ">" if processor == _MIPS else "<"
     while True:
         if at + 2 > end:
-            raise InputError(
-                "the end of the parameters", source=path, field=f"byte {at}"
-            )
+            raise InputError("the end of the parameters", path, f"byte {at}")
         length, group = (int(x) for x in content[at : at + 2].view(np.int8))
         if length == 0 or group == 0:
             break
         name_end = at + 2 + abs(length)
         if name_end + 2 > end:
-            raise InputError(
-                f"a name of {abs(length)} bytes", source=path, field=f"byte {at}"
-            )
+            raise InputError(f"a name of {abs(length)} bytes", path, f"byte {at}")
         name = content[at + 2 : name_end].tobytes().decode("latin-1").strip().upper()
         (step,) = struct.unpack(f"{order}h", content[name_end : name_end + 2].tobytes())
         if group < 0:
@@ -118,10 +105,8 @@ def _read_parameters(
         if step == 0:
             break
         if step < 3:
-            raise InputError(
-                "a step forward to the next parameter", source=path,
-                field=f"byte {name_end}", value=step,
-            )  # fmt: skip
+            expected = "a step forward to the next parameter"
+            raise InputError(expected, path, f"byte {name_end}", step)
         at = name_end + step
     return {(groups.get(g, ""), n): v for g, n, v in found}
 
@@ -137,12 +122,8 @@ def _read_value(
     count = int(np.prod(sizes, dtype=object)) if sizes else 1
     data = at + 2 + max(rank, 0)
     if width == 0 or not 0 <= rank <= 7 or data + count * width > len(content):
-        raise InputError(
-            "type -1, 1, 2 or 4, at most 7 dimensions, and as many values",
-            source=path,
-            field=f"byte {at}",
-            value=[kind, rank, *sizes],
-        )
+        expected = "type -1, 1, 2 or 4, at most 7 dimensions, and as many values"
+        raise InputError(expected, path, f"byte {at}", [kind, rank, *sizes])
     raw = content[data : data + count * width]
     if kind == -1:
         text, wide = raw.tobytes().decode("latin-1"), sizes[0] if sizes else 1
@@ -167,7 +148,7 @@ def _number(parameters: _Parameters, group: str, name: str) -> float | None:
     return float(value[0])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class _Header:
     """Where the samples lie and how."""
 
@@ -197,21 +178,13 @@ class _Header:
         rate = rate if said is None else said
         start = (int(words[8]) - 1) * _BLOCK
         if not 0 < points <= MAX_POINTS:
-            raise InputError(
-                f"between 1 and {MAX_POINTS} points", source=path, field="byte 2",
-                value=points,
-            )  # fmt: skip
+            expected = f"between 1 and {MAX_POINTS} points"
+            raise InputError(expected, path, "byte 2", points)
         if frames < 1 or not _BLOCK <= start <= len(content):
-            raise InputError(
-                "samples, after the parameters",
-                source=path,
-                field="byte 6 (frames), byte 16 (block)",
-                value=[frames, start // _BLOCK + 1],
-            )
-        return cls(
-            points=points, analog=analog, frames=frames, start=start, scale=scale,
-            rate=rate,
-        )  # fmt: skip
+            where, found = "byte 6 (frames), byte 16 (block)", start // _BLOCK + 1
+            expected = "samples, after the parameters"
+            raise InputError(expected, path, where, [frames, found])
+        return cls(points, analog, frames, start, scale, rate)
 
 
 def _long_frames(parameters: _Parameters) -> int | None:
@@ -245,12 +218,11 @@ def _read_samples(
     end = header.start + header.frames * row
     if end > len(content):
         present = (len(content) - header.start) // row
-        raise InputError(
+        expected = (
             f"{header.frames} samples of {row} bytes each from byte {header.start} on; "
-            f"the file ends after {present}",
-            source=path,
-            field=f"byte {len(content)}",
+            f"the file ends after {present}"
         )
+        raise InputError(expected, path, f"byte {len(content)}")
     rows = content[header.start : end].reshape(header.frames, row)
     out = np.empty((header.frames, header.points, 3), dtype=np.float32)
     step = max(1, (1 << 22) // row)
@@ -274,10 +246,7 @@ def _labels(parameters: _Parameters, count: int, path: Path) -> list[str]:
     while more := _words(parameters, f"LABELS{k}"):
         labels, k = labels + more, k + 1
     if len(labels) < count:
-        raise InputError(
-            f"{count} labels in POINT:LABELS", source=path, field="POINT:LABELS",
-            value=len(labels),
-        )  # fmt: skip
+        raise InputError(f"{count} labels", path, "POINT:LABELS", len(labels))
     return labels[:count]
 
 

@@ -15,8 +15,14 @@ from typing import BinaryIO
 import numpy as np
 
 from clamber.errors import InputError
-from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
-from clamber.recording.table import place_rows, read_blocks
+from clamber.recording.points import (
+    MAX_POINTS,
+    Points,
+    place_rows,
+    read_table,
+    unique_names,
+    unit_of,
+)
 
 MAGIC = b"Format Version"
 _LINES = 12  # lines of heading, at most
@@ -34,39 +40,23 @@ def read_motive(path: Path) -> Points:
     with path.open("rb") as file:
         said, rows, first = _read_heading(file, path)
         columns = _columns(rows, path, first - 1)
-        names = unique_names([name for _, name in columns])
-        where = np.array([c["Position"] for c in columns.values()])
-        turned = {
-            n: c["Rotation"]
-            for n, c in zip(names, columns.values(), strict=True)
-            if "Rotation" in c
-        }
-        frame: list[np.ndarray] = []
-        position: list[np.ndarray] = []
-        orientation: dict[str, list[np.ndarray]] = {n: [] for n in turned}
-        for block in read_blocks(
-            file, columns=len(rows["axis"]), delimiter=",", line=first, source=path
-        ):
-            frame.append(block[:, 0])
-            position.append(block[:, where])
-            for n, four in turned.items():
-                orientation[n].append(block[:, four])
-    if not position:
-        raise InputError("rows of numbers", source=path, field=f"line {first}")
-    number = np.concatenate(frame)
-
-    def placed(blocks: list[np.ndarray]) -> np.ndarray:
-        return place_rows(
-            number, np.concatenate(blocks), line=first, what="Frame", source=path
-        )
-
+        blocks = list(read_table(file, len(rows["axis"]), ",", first, path))
+    if not blocks:
+        raise InputError("rows of numbers", path, f"line {first}")
+    table = np.concatenate(blocks)
+    table = place_rows(table[:, 0], table, first, "Frame", path)
+    names = unique_names([name for _, name in columns])
     return Points(
         names=names,
-        position=placed(position),
+        position=table[:, np.array([c["Position"] for c in columns.values()])],
         rate=_rate(said, path),
         unit=unit_of(said.get("length units", "meters"), path, "line 1, Length Units"),
         up="y",
-        orientation={n: placed(q) for n, q in orientation.items()},
+        orientation={
+            n: table[:, c["Rotation"]]
+            for n, c in zip(names, columns.values(), strict=True)
+            if "Rotation" in c
+        },
     )
 
 
@@ -94,11 +84,8 @@ def _read_heading(
         elif len(cells) > 1 and cells[1].strip():
             rows[cells[1].strip().lower()] = cells
         before = cells
-    raise InputError(
-        "`Format Version` first, and later a line that begins with Frame,Time",
-        source=path,
-        field=f"line {1 if not said else _LINES}",
-    )
+    expected = "`Format Version` first, and later a line that begins with Frame,Time"
+    raise InputError(expected, path, f"line {_LINES if said else 1}")
 
 
 def _columns(
@@ -112,11 +99,8 @@ def _columns(
     width = len(rows["axis"])
     for row in ("type", "name", "measure"):
         if len(rows.get(row, [])) > width or row not in rows:
-            raise InputError(
-                f"a line of `{row.title()}`, as long as that of the axes",
-                source=path,
-                field=f"line {line}",
-            )
+            expected = f"a line of `{row.title()}`, as long as that of the axes"
+            raise InputError(expected, path, f"line {line}")
         rows[row] = rows[row] + [""] * (width - len(rows[row]))
     found: dict[tuple[str, str], dict[str, dict[str, int]]] = {}
     for k in range(2, width):
@@ -131,12 +115,8 @@ def _columns(
             if set("WXYZ") <= set(turn):
                 out[key]["Rotation"] = [turn[a] for a in "WXYZ"]
     if not 0 < len(out) <= MAX_POINTS:
-        raise InputError(
-            f"between 1 and {MAX_POINTS} columns of Position X, Y, Z",
-            source=path,
-            field=f"line {line}",
-            value=len(out),
-        )
+        expected = f"between 1 and {MAX_POINTS} columns of Position X, Y, Z"
+        raise InputError(expected, path, f"line {line}", len(out))
     return dict(sorted(out.items(), key=lambda i: _ORDER.get(i[0][0].lower(), 3)))
 
 
@@ -146,8 +126,6 @@ def _rate(said: dict[str, str], path: Path) -> float:
             try:
                 return float(said[key])
             except ValueError as e:
-                raise InputError(
-                    "a number [Hz]", source=path, field=f"line 1, {key}",
-                    value=said[key],
-                ) from e  # fmt: skip
-    raise InputError("`Export Frame Rate`", source=path, field="line 1")
+                where = f"line 1, {key}"
+                raise InputError("a number [Hz]", path, where, said[key]) from e
+    raise InputError("`Export Frame Rate`", path, "line 1")

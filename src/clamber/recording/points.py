@@ -1,16 +1,21 @@
 """What a recording's file says before anybody asks who the person is: named points.
 
 Every reader ends here. Units and axes are still the file's own; where the file does not
-say which, the field is None and `recording` decides.
+say which, the field is None and `recording` decides. Tables of numbers in text files,
+which three formats have, are read here too.
 
 Shapes: T samples, F points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import io
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -66,31 +71,20 @@ def read_safely(read: Callable[[Path], Points], path: Path) -> Points:
     except OSError as e:
         raise unreadable(path, e) from e
     if len(points.position) < 2 or not points.names:
-        raise InputError(
-            "at least two samples of at least one point",
-            source=path,
-            field="shape",
-            value=points.position.shape,
-        )
+        expected = "at least two samples of at least one point"
+        raise InputError(expected, path, "shape", points.position.shape)
     if not 0.0 < points.rate <= MAX_RATE:  # also where it is NaN
-        raise InputError(
-            f"a positive rate, at most {MAX_RATE:g} Hz",
-            source=path,
-            field="rate",
-            value=points.rate,
-        )
+        expected = f"a positive rate, at most {MAX_RATE:g} Hz"
+        raise InputError(expected, path, "rate", points.rate)
     farthest = FARTHEST / (points.unit or 1.0)
     for first in range(0, len(points.position), _BLOCK):  # no second copy of it all
         block = points.position[first : first + _BLOCK]
         far = ~(np.abs(block) <= farthest) & ~np.isnan(block)
         if far.any():
             k, f, _ = np.argwhere(far)[0]
-            raise InputError(
-                f"finite coordinates, at most {FARTHEST:g} m",
-                source=path,
-                field=f"{points.names[f]}, sample {first + k}",
-                value=block[k, f].tolist(),
-            )
+            expected = f"finite coordinates, at most {FARTHEST:g} m"
+            where = f"{points.names[f]}, sample {first + k}"
+            raise InputError(expected, path, where, block[k, f].tolist())
     return points
 
 
@@ -102,12 +96,8 @@ def unit_of(word: str, source: Path, field: str) -> float:
     """
     plain = word.strip().strip("\0").lower()
     if plain not in METRES:
-        raise InputError(
-            "a unit of length such as m, cm, mm or inches",
-            source=source,
-            field=field,
-            value=word,
-        )
+        expected = "a unit of length such as m, cm, mm or inches"
+        raise InputError(expected, source, field, word)
     return METRES[plain]
 
 
@@ -129,3 +119,127 @@ def unique_names(names: Sequence[str]) -> tuple[str, ...]:
         taken.add(fresh)
         out.append(fresh)
     return tuple(out)
+
+
+# Tables of numbers.
+
+_READ = 1 << 20  # [byte] read at once
+_ROW = re.compile(r"at row (\d+)(?:, column (\d+))?")  # in what NumPy says is wrong
+
+
+def read_table(
+    file: BinaryIO, columns: int, delimiter: str | None, line: int, source: Path
+) -> Iterator[np.ndarray]:
+    """Blocks (N, columns) of numbers until the end of the file.
+
+    Args:
+        file: Open at the start of the first row.
+        columns: How many numbers a row has; one delimiter more at its end is allowed.
+        delimiter: One character, or None for any white space.
+        line: Number of the first row's line, for messages.
+        source: The file's name, for messages.
+
+    Yields:
+        Arrays of float; a cell that is empty is NaN.
+
+    Raises:
+        InputError: A row has other than `columns` cells or a cell is no finite number.
+    """
+    gap = delimiter.encode() if delimiter else b""
+    most = min(_READ, os.fstat(file.fileno()).st_size)
+    while block := file.read(most):
+        block += file.readline()
+        lines = block.replace(b"\r", b"").split(b"\n")
+        rows = {
+            number: _filled(text, columns, gap)
+            for number, text in enumerate(lines, line)
+            if text.strip()
+        }
+        line += len(lines) - 1
+        if rows:
+            yield _parsed(rows, columns, delimiter, source)
+
+
+def _filled(text: bytes, columns: int, gap: bytes) -> bytes:
+    """A row without a delimiter too many, `nan` in its empty cells."""
+    if not gap:
+        return text
+    if text.endswith(gap) and text.count(gap) == columns:
+        text = text[: -len(gap)]
+    for _ in range(2):  # cells side by side
+        text = text.replace(gap + gap, gap + b"nan" + gap)
+    text = b"nan" + text if text.startswith(gap) else text
+    return text + b"nan" if text.endswith(gap) else text
+
+
+def _parsed(
+    rows: dict[int, bytes], columns: int, delimiter: str | None, source: Path
+) -> np.ndarray:
+    """Numbers (N, columns) of rows by their lines."""
+    lines = list(rows)
+    text = io.BytesIO(b"\n".join(rows.values()))
+    try:
+        x = np.loadtxt(text, delimiter=delimiter, comments=None, ndmin=2)
+    except (ValueError, OverflowError) as e:
+        row, cell = 0, None
+        if said := _ROW.search(str(e)):
+            row, cell = int(said[1]), said[2]
+            row -= cell is None  # NumPy counts rows from 1 where it counts cells
+        if cell is None:
+            found = len(rows[lines[row]].split(delimiter and delimiter.encode()))
+            where = f"line {lines[row]}"
+            raise InputError(f"{columns} cells", source, where, found) from e
+        where = f"line {lines[row]}, cell {cell}"
+        raise InputError(f"a finite number ({e})", source, where) from e
+    if x.shape[1] != columns:
+        raise InputError(f"{columns} cells", source, f"line {lines[0]}", x.shape[1])
+    if np.isinf(x).any():
+        row, cell = np.argwhere(np.isinf(x))[0]
+        where = f"line {lines[row]}, cell {cell + 1}"
+        raise InputError("a finite number", source, where, x[row, cell])
+    return x
+
+
+def place_rows(
+    number: np.ndarray, rows: np.ndarray, line: int, what: str, source: Path
+) -> np.ndarray:
+    """Rows (N, ...) in their places by their numbers (N,): what is missing is NaN.
+
+    Args:
+        number: Of each row's sample, as the file counts them.
+        rows: What the file says of it.
+        line: Number of the first row's line, for messages.
+        what: The column that counts, for messages.
+        source: The file's name, for messages.
+
+    Raises:
+        InputError: Numbers do not increase one by one, or more samples are missing
+            than there are.
+    """
+    step = np.diff(number)
+    if np.all(step == 1.0):
+        return rows
+    wrong = ~((step >= 1.0) & (step == np.round(step)))
+    if not wrong.any():
+        missing = np.cumsum(step - 1.0)
+        wrong = missing > len(number)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        two = f"{number[k]:.6g} and then {number[k + 1]:.6g}"
+        expected = f"{what} to count the rows, found {two}"
+        raise InputError(expected, source, f"line {line + k + 1}")
+    place = (number - number[0]).astype(int)
+    out = np.full((int(place[-1]) + 1, *rows.shape[1:]), np.nan)
+    out[place] = rows
+    return out
+
+
+def check_count(found: int, said: float, line: int, what: str, source: Path) -> None:
+    """Refuse a file that ends before its heading says so.
+
+    Raises:
+        InputError: There are fewer rows than `said`, from `line` on.
+    """
+    if not found >= said:
+        expected = f"{said:g} rows, as {what} says; the file ends after {found}"
+        raise InputError(expected, source, f"line {line + found}")

@@ -7,8 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from clamber.errors import InputError
-from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
-from clamber.recording.table import check_count, place_rows, read_blocks
+from clamber.recording.points import (
+    MAX_POINTS,
+    Points,
+    check_count,
+    place_rows,
+    read_table,
+    unique_names,
+    unit_of,
+)
 
 MAGIC = b"PathFileType"
 _HEADING = 1 << 20  # [byte] a longer line of heading is none
@@ -29,7 +36,7 @@ def read_trc(path: Path) -> Points:
             for _ in range(5)
         ]
         if not heading[0].startswith(MAGIC.decode()):
-            raise InputError("`PathFileType`", source=path, field="line 1")
+            raise InputError("`PathFileType`", path, "line 1")
         keys, values = heading[1].split("\t"), heading[2].split("\t")
         said = {
             k.strip().lower(): v.strip() for k, v in zip(keys, values, strict=False)
@@ -37,42 +44,31 @@ def read_trc(path: Path) -> Points:
         rate = _number(said, "DataRate", path)
         count = _number(said, "NumMarkers", path)
         if "units" not in said:
-            raise InputError("`Units` in the heading", source=path, field="line 2")
+            raise InputError("`Units` in the heading", path, "line 2")
         unit = unit_of(said["units"], path, "line 3, Units")
         names = [n.strip() for n in heading[3].split("\t")]
         if [n.lower() for n in names[:2]] != ["frame#", "time"]:
-            raise InputError(
-                "`Frame#`, `Time` and the markers' names", source=path, field="line 4"
-            )
+            expected = "`Frame#`, `Time` and the markers' names"
+            raise InputError(expected, path, "line 4")
         names = [n for n in names[2:] if n]
         if len(names) != count or not 0 < count <= MAX_POINTS:
-            raise InputError(
-                f"as many names as NumMarkers says ({count:g})",
-                source=path,
-                field="line 4",
-                value=len(names),
-            )
+            expected = f"as many names as NumMarkers says ({count:g})"
+            raise InputError(expected, path, "line 4", len(names))
         line, place = 6, file.tell()
         while (text := file.readline(_HEADING)) and not text.strip():
             line, place = line + 1, file.tell()  # a line between heading and rows
         file.seek(place)
-        first, numbers, blocks = line, [], []
-        for rows in read_blocks(
-            file, columns=2 + 3 * len(names), delimiter="\t", line=line, source=path
-        ):
-            numbers.append(rows[:, 0])
-            blocks.append(rows[:, 2:].reshape(len(rows), len(names), 3))
+        blocks = list(read_table(file, 2 + 3 * len(names), "\t", line, path))
     if not blocks:
-        raise InputError("rows of numbers", source=path, field=f"line {first}")
-    number = np.concatenate(numbers)
+        raise InputError("rows of numbers", path, f"line {line}")
+    rows = np.concatenate(blocks)
     if "numframes" in said:
         expected = _number(said, "NumFrames", path)
-        check_count(len(number), expected, line=first, what="NumFrames", source=path)
+        check_count(len(rows), expected, line, "NumFrames", path)
+    place = rows[:, 2:].reshape(len(rows), len(names), 3)
     return Points(
         names=unique_names(names),
-        position=place_rows(
-            number, np.concatenate(blocks), line=first, what="Frame#", source=path
-        ),
+        position=place_rows(rows[:, 0], place, line, "Frame#", path),
         rate=rate,
         unit=unit,
         usual_up="y",
@@ -85,6 +81,5 @@ def _number(said: dict[str, str], key: str, path: Path) -> float:
     try:
         return float(text or "")
     except ValueError as e:
-        raise InputError(
-            f"`{key}` with a number below it", source=path, field="line 3", value=text
-        ) from e
+        expected = f"`{key}` with a number below it"
+        raise InputError(expected, path, "line 3", text) from e
