@@ -1,4 +1,4 @@
-"""Which part of the person bears load on which support, and when.
+"""Which part of the person is loaded on which support, and when.
 
 A part is in contact while one of its points is near a support, inside its outline and
 slow, with hysteresis in height and speed and a minimum duration. Joint centres lie
@@ -80,6 +80,10 @@ class _Window:
     high: float
     spread: float
 
+    def holds(self, height: np.ndarray, slack: float = 0.0) -> np.ndarray:
+        """Whether heights (T,) are within, by `slack` widened [m]."""
+        return (height > self.low - slack) & (height < self.high + slack)
+
 
 # By part without side and, after the dot, by point. `Hand` alone stands for a wrist, or
 # for whatever single point there is of a hand; with fingers, the fingers count.
@@ -97,31 +101,44 @@ _SIZE = {"forearm": 0.254, "thigh": 0.373, "shank": 0.453}  # [m]
 _PLATEAU = 10  # [%] the percentile of resting heights that is the lowest plateau
 _BELOW = 0.04  # [m] under the plateau it is no longer the same thing at rest
 _UNDER = -0.15  # [m] deeper than this, a point is under the support, not on it
+_SEAT_UNDER = -0.05  # [m] deeper than this, hips are under the support
 _THIGH_UP = 0.1  # sine of a kneeling thigh's slope, at least: the hip is over the knee
 _SHANK_LIES = 0.6  # sine of a kneeling shank's slope, at most
-_SHANK_UP = (
-    0.3  # sine of a standing shank's slope, at least: else the instep lies there
-)
+_SHANK_UP = 0.3  # sine of a standing shank's slope, at least: else the instep lies
 _SEAT_SPEED = 1.5  # a seat may be that much faster than a hand: hips are never still
-_JOIN_DISTANCE = 0.03  # [m]
+_JOIN_DISTANCE = 0.03  # [m] an interruption that ends so near is none
 _MOVED = 0.06  # [m] what rests so far away is another contact, lifted or slid
+_REST = 0.3  # [s] from whose median a resting place is read
+_SEARCH = 0.5  # [s] a change lies at most so far inside its coarse interval
+_AROUND = 0.1  # [s] half the stretch of track that the fit looks at
+_STILL = 0.015  # [m] a part that rolls in place changes height by less than this
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Tracks:
-    """Smoothed tracks of a demonstration and what one may read off them."""
+    """Smoothed tracks of a demonstration, in a scene, with the thresholds."""
 
     demo: Demonstration
+    scene: Scene
+    options: DetectOptions
     position: np.ndarray  # (T, F, 3) [m]
-    speed: np.ndarray  # (T, F) [m/s]
+    speeds: np.ndarray  # (T, F) [m/s]
 
     def at(self, name: str) -> np.ndarray:
         """(T, 3) smoothed track of a point."""
         return self.position[:, self.demo.names.index(name)]
 
+    def speed(self, name: str) -> np.ndarray:
+        """(T,) of a point."""
+        return self.speeds[:, self.demo.names.index(name)]
+
     def valid(self, *names: str) -> np.ndarray:
         """(T,) whether all these points are seen."""
-        return _all(self.demo.valid[:, [self.demo.names.index(n) for n in names]].T)
+        return self.demo.valid[:, [self.demo.names.index(n) for n in names]].all(axis=1)
+
+    def samples(self, seconds: float) -> int:
+        """So many samples last that long."""
+        return round(seconds * self.demo.rate)
 
 
 def detect_contacts(
@@ -143,28 +160,24 @@ def detect_contacts(
     Raises:
         InputError: Nothing is in contact at any time.
     """
-    options = options or DetectOptions()
     scene = scene or demo.scene
-    tracks = _smooth(demo, options)
-    seats = _find_seats(tracks, scene, options)
-    near = {p: _nearness(tracks, p, scene, seats, options) for p in _counting(demo)}
-    windows = _calibrate(tracks, near, options)
+    tracks = _smooth(demo, scene, options or DetectOptions())
+    seats = _find_seats(tracks)
+    near = {p: _nearness(tracks, p, seats) for p in _evidence(demo)}
+    windows = _calibrate(tracks, near)
     found = [
         interval
         for part in PARTS
-        for interval in _apart(
-            _part_intervals(tracks, part, near, windows, scene, options)
-        )
+        for interval in _apart(_part_intervals(tracks, part, near, windows))
     ]
     if not found:
-        raise InputError(
-            "at least one contact: check unit, up and the boxes", source=demo.source
-        )
+        expected = "at least one contact: check unit, up and the boxes"
+        raise InputError(expected, demo.source)
     found.sort(key=lambda i: (i.t0, i.part))
-    t, stances = _stances(tracks, found, options)
+    t, stances = _stances(tracks, found)
     seated = [
-        _interval(tracks, SEAT, "Pelvis", support, i, j, demo.t[[i, j]])
-        for support, _, spans in seats
+        _interval(tracks, SEAT, support, (i, j - 1), *demo.t[[i, j - 1]])
+        for support, spans in zip(scene.supports, seats, strict=True)
         for i, j in spans
     ]
     return ContactSequence(
@@ -177,39 +190,25 @@ def detect_contacts(
     )
 
 
-def _any(rows: np.ndarray) -> np.ndarray:
-    """(T,) whether any of the rows (N, T) is true."""
-    return np.logical_or.reduce(rows, axis=0)
-
-
-def _all(rows: np.ndarray) -> np.ndarray:
-    """(T,) whether all of the rows (N, T) are true."""
-    return np.logical_and.reduce(rows, axis=0)
-
-
-def _samples(seconds: float, rate: float) -> int:
-    """An odd number of samples, enough for a quadratic."""
-    return max(5, 2 * round(seconds * rate / 2) + 1)
-
-
-def _smooth(demo: Demonstration, options: DetectOptions) -> _Tracks:
+def _smooth(demo: Demonstration, scene: Scene, options: DetectOptions) -> _Tracks:
     from scipy.signal import savgol_filter
 
     longest = (len(demo.t) - 1) // 2 * 2 + 1
     if longest < 5:
-        raise InputError("five samples at least", source=demo.source, value=longest)
-    n = min(_samples(options.smoothing, demo.rate), longest)
-    short = min(_samples(options.smoothing / 2, demo.rate), longest)
+        raise InputError("five samples at least", demo.source, value=longest)
+
+    def samples(seconds: float) -> int:
+        """An odd number, enough for a quadratic."""
+        return min(max(5, 2 * round(seconds * demo.rate / 2) + 1), longest)
+
     p, dt = demo.position, 1.0 / demo.rate
+    n, short = samples(options.smoothing), samples(options.smoothing / 2)
     velocity = np.asarray(savgol_filter(p, n, 2, deriv=1, delta=dt, axis=0))
-    return _Tracks(
-        demo=demo,
-        position=np.asarray(savgol_filter(p, short, 2, axis=0)),
-        speed=np.linalg.norm(velocity, axis=2),
-    )
+    position = np.asarray(savgol_filter(p, short, 2, axis=0))
+    return _Tracks(demo, scene, options, position, np.linalg.norm(velocity, axis=2))
 
 
-def _counting(demo: Demonstration) -> list[str]:
+def _evidence(demo: Demonstration) -> list[str]:
     """Points that are evidence of a contact; a wrist only without fingers."""
     out = []
     for part in PARTS:
@@ -218,13 +217,8 @@ def _counting(demo: Demonstration) -> list[str]:
     return out
 
 
-def _kind(point: str) -> str:
-    """Point without its side: what both sides share."""
-    return point[1:]
-
-
-def _window(demo: Demonstration, point: str) -> _Window:
-    kind = _kind(point)
+def _window(demo: Demonstration, kind: str) -> _Window:
+    """Of a point without its side."""
     part, dot, _ = kind.partition(".")
     usual = estimate_offsets(_SIZE, {}).get(kind, 0.0)
     shift = demo.offsets.get(kind, usual) - usual
@@ -236,40 +230,33 @@ def _window(demo: Demonstration, point: str) -> _Window:
 class _Nearness:
     """Of one point over one support: height (T,), and where it could be in contact."""
 
-    support: Support
     height: np.ndarray
     possible: np.ndarray
 
 
 def _nearness(
-    tracks: _Tracks, point: str, scene: Scene, seats: list, options: DetectOptions
+    tracks: _Tracks, point: str, seats: list[list[tuple[int, int]]]
 ) -> list[_Nearness]:
     """Heights over all supports; only the highest support below a point counts."""
     p, part = tracks.at(point), point.split(".")[0]
-    seen = tracks.valid(point)
-    shape = _holds_shape(tracks, part)
-    over = [
-        (s, s.height(p), s.inside(p, -options.edge_slack) & (s.height(p) > _UNDER))
-        for s in scene.supports
-    ]
+    able = tracks.valid(point) & _in_shape(tracks, part)
+    slack = tracks.options.edge_slack
+    supports = tracks.scene.supports
+    height = np.array([s.height(p) for s in supports])
+    above = np.array([s.inside(p, -slack) for s in supports]) & (height > _UNDER)
     out = []
-    for support, height, above in over:
-        covered = np.zeros(len(p), dtype=bool)
-        for other, other_height, other_above in over:
-            if other is not support:
-                covered |= other_above & (other_height < height)
-        seated = np.zeros(len(p), dtype=bool)
+    for k, spans in enumerate(seats):
+        covered = (above & (height < height[k])).any(axis=0)
+        possible = above[k] & ~covered & able
         if part.endswith("Knee"):
-            for other, mask, _ in seats:
-                seated |= mask & (other.name == support.name)
-        out.append(
-            _Nearness(support, height, above & ~covered & seen & shape & ~seated)
-        )
+            for i, j in spans:
+                possible[i:j] = False
+        out.append(_Nearness(height[k], possible))
     return out
 
 
-def _holds_shape(tracks: _Tracks, part: str) -> np.ndarray:
-    """(T,) whether the leg is in a shape in which its knee or foot can bear load.
+def _in_shape(tracks: _Tracks, part: str) -> np.ndarray:
+    """(T,) whether the leg is in a shape in which its knee or foot can be loaded.
 
     Kneeling, the shank lies and the hip is over the knee; standing, the shank is up.
     Where a joint is not seen the shape is unknown and speaks against nothing.
@@ -287,25 +274,21 @@ def _holds_shape(tracks: _Tracks, part: str) -> np.ndarray:
     return kneels | ~tracks.valid(*names)
 
 
-def _find_seats(tracks: _Tracks, scene: Scene, options: DetectOptions) -> list:
-    """Each support with the mask (T,) and the index ranges of sitting on it."""
+def _find_seats(tracks: _Tracks) -> list[list[tuple[int, int]]]:
+    """Index ranges [i, j) of sitting on each support."""
+    options = tracks.options
     hips = (tracks.at("LHip") + tracks.at("RHip")) / 2
-    names = [tracks.demo.names.index(n) for n in ("LHip", "RHip")]
-    speed = tracks.speed[:, names].mean(axis=1)
+    speed = (tracks.speed("LHip") + tracks.speed("RHip")) / 2
+    enter, leave = (_SEAT_SPEED * v for v in (options.enter_speed, options.exit_speed))
+    seen = tracks.valid("LHip", "RHip")
     out = []
-    for support in scene.supports:
+    for support in tracks.scene.supports:
         height = support.height(hips)
-        low = support.inside(hips, -options.edge_slack) & (height > -0.05)
-        low &= tracks.valid("LHip", "RHip")
-        loose = low & (height < options.seat_height + options.height_slack)
-        loose &= speed < _SEAT_SPEED * options.exit_speed
-        strict = loose & (height < options.seat_height)
-        strict &= speed < _SEAT_SPEED * options.enter_speed
-        spans = _hysteresis(strict, loose, options.min_duration * tracks.demo.rate)
-        mask = np.zeros(len(hips), dtype=bool)
-        for i, j in spans:
-            mask[i:j] = True
-        out.append((support, mask, [(i, j - 1) for i, j in spans]))
+        over = support.inside(hips, -options.edge_slack) & (height > _SEAT_UNDER) & seen
+        loose = over & (height < options.seat_height + options.height_slack)
+        loose &= speed < leave
+        strict = loose & (height < options.seat_height) & (speed < enter)
+        out.append(_hysteresis(strict, loose, options.min_duration * tracks.demo.rate))
     return out
 
 
@@ -325,22 +308,19 @@ def _hysteresis(
     return out
 
 
-def _calibrate(
-    tracks: _Tracks, near: dict[str, list[_Nearness]], options: DetectOptions
-) -> dict[str, _Window]:
+def _calibrate(tracks: _Tracks, near: dict[str, list[_Nearness]]) -> dict[str, _Window]:
     """Windows by kind of point, narrowed to the lowest plateau of either side."""
     resting: dict[str, list[np.ndarray]] = {}
     for point, over in near.items():
-        w = _window(tracks.demo, point)
-        slow = tracks.speed[:, tracks.demo.names.index(point)] < options.enter_speed
-        for n in over:
-            at_rest = n.possible & slow & (n.height > w.low) & (n.height < w.high)
-            resting.setdefault(_kind(point), []).append(n.height[at_rest])
-    enough = options.min_duration * tracks.demo.rate
+        w = _window(tracks.demo, point[1:])
+        slow = tracks.speed(point) < tracks.options.enter_speed
+        resting.setdefault(point[1:], []).extend(
+            n.height[n.possible & slow & w.holds(n.height)] for n in over
+        )
     out = {}
     for kind, several in resting.items():
-        w, heights = _window(tracks.demo, "L" + kind), np.concatenate(several)
-        if len(heights) >= enough:
+        w, heights = _window(tracks.demo, kind), np.concatenate(several)
+        if len(heights) >= tracks.options.min_duration * tracks.demo.rate:
             plateau = float(np.percentile(heights, _PLATEAU))
             low = max(w.low, plateau - _BELOW)
             w = _Window(low, min(w.high, plateau + w.spread), w.spread)
@@ -353,46 +333,41 @@ def _part_intervals(
     part: str,
     near: dict[str, list[_Nearness]],
     windows: dict[str, _Window],
-    scene: Scene,
-    options: DetectOptions,
 ) -> Iterable[ContactInterval]:
     """Contacts of one part, its points taken together, on one support at a time."""
-    demo = tracks.demo
+    demo, options = tracks.demo, tracks.options
     points = [p for p in demo.points_of(part) if p in near]
-    for k, support in enumerate(scene.supports):
+    least, about = options.min_duration * demo.rate, tracks.samples(options.smoothing)
+    for k, support in enumerate(tracks.scene.supports):
         loose = np.zeros((len(points), len(demo.t)), dtype=bool)
         strict = np.zeros_like(loose)
         for row, point in enumerate(points):
-            n, w = near[point][k], windows[_kind(point)]
-            speed = tracks.speed[:, demo.names.index(point)]
-            slack = options.height_slack
+            n, w, speed = near[point][k], windows[point[1:]], tracks.speed(point)
             loose[row] = n.possible & (speed < options.exit_speed)
-            loose[row] &= (n.height > w.low - slack) & (n.height < w.high + slack)
+            loose[row] &= w.holds(n.height, options.height_slack)
             strict[row] = loose[row] & (speed < options.enter_speed)
-            strict[row] &= (n.height > w.low) & (n.height < w.high)
-        either = _join(tracks, part, _any(loose), options)
-        least = options.min_duration * demo.rate
-        whole = _hysteresis(_any(strict), either, least)
-        rests = [
-            s for i, j in whole for s in _places(tracks, points, strict, (i, j), least)
-        ]
-        for i, j in rests:
-            some = round(options.smoothing * demo.rate)
-            firsts, lasts = (
-                [p for p, ok in zip(points, _any(loose[:, m].T), strict=True) if ok]
-                for m in (slice(i, min(i + some, j)), slice(max(j - some, i), j))
-            )
-            t0, t1 = float(demo.t[0]), float(demo.t[-1])
-            if i > 0:  # the part touches with the first of its points
-                t0 = min(
-                    _refine(tracks, p, support, i, j, leaving=False) for p in firsts
-                )
-            if j < len(demo.t):
-                t1 = max(_refine(tracks, p, support, i, j, leaving=True) for p in lasts)
-            if t1 - t0 < options.min_duration:
-                continue
-            ends, t = _limb_ends(demo, part), np.array([t0, t1])
-            yield _interval(tracks, part, part, support, i, j - 1, t, ends)
+            strict[row] &= w.holds(n.height)
+        either = _join(tracks, part, loose.any(axis=0))
+        for whole in _hysteresis(strict.any(axis=0), either, least):
+            for i, j in _places(tracks, points, strict, whole, least):
+                ends = {
+                    leaving: [
+                        _refine(tracks, p, support, i, j, leaving)
+                        for p, ok in zip(
+                            points, loose[:, some].any(axis=1), strict=True
+                        )
+                        if ok
+                    ]
+                    for leaving, some in (
+                        (False, slice(i, min(i + about, j))),
+                        (True, slice(max(j - about, i), j)),
+                    )
+                }
+                # A part touches with the first of its points and leaves with the last.
+                t0 = min(ends[False]) if i > 0 else float(demo.t[0])
+                t1 = max(ends[True]) if j < len(demo.t) else float(demo.t[-1])
+                if t1 - t0 >= options.min_duration:
+                    yield _interval(tracks, part, support, (i, j - 1), t0, t1)
 
 
 def _places(
@@ -418,21 +393,19 @@ def _places(
     i, j = whole
     if points == [points[0][0] + "Foot"]:
         return [(i, j)]
-    still = [(a + i, b + i) for a, b in runs(_any(strict[:, i:j])) if b - a >= least]
+    resting = runs(strict[:, i:j].any(axis=0))
+    still = [slice(a + i, b + i) for a, b in resting if b - a >= least]
     out, first = [], i
-    for (a0, a1), (b0, b1) in pairwise(still):
+    for a, b in pairwise(still):
         moved = []
-        for row, point in enumerate(points):
-            p = tracks.at(point)
-            before, after = (
-                p[m][strict[row, m]] for m in (slice(a0, a1), slice(b0, b1))
-            )
+        for p, ok in zip(map(tracks.at, points), strict, strict=True):
+            before, after = p[a][ok[a]], p[b][ok[b]]
             if len(before) and len(after):
                 gap = np.median(after, axis=0) - np.median(before, axis=0)
                 moved.append(float(np.linalg.norm(gap)) > _MOVED)
         if moved and all(moved):
-            out.append((first, a1))
-            first = b0
+            out.append((first, a.stop))
+            first = b.start
     return [*out, (first, j)]
 
 
@@ -449,27 +422,19 @@ def _apart(intervals: Iterable[ContactInterval]) -> list[ContactInterval]:
     return out
 
 
-def _join(
-    tracks: _Tracks, part: str, mask: np.ndarray, options: DetectOptions
-) -> np.ndarray:
+def _join(tracks: _Tracks, part: str, mask: np.ndarray) -> np.ndarray:
     """Close interruptions that are short, seen and end where they began."""
-    mask, p = mask.copy(), tracks.at(part)
-    seen = tracks.valid(part)
+    mask, p, seen = mask.copy(), tracks.at(part), tracks.valid(part)
+    longest = tracks.options.join * tracks.demo.rate
     for i, j in runs(~mask):
         inside = i > 0 and j < len(mask)
-        if inside and (j - i) <= options.join * tracks.demo.rate and seen[i:j].all():
+        if inside and (j - i) <= longest and seen[i:j].all():
             mask[i:j] = np.linalg.norm(p[j] - p[i - 1]) < _JOIN_DISTANCE
     return mask
 
 
-_REST = 0.3  # [s] from whose median a resting place is read
-_SEARCH = 0.5  # [s] a change lies at most so far inside its coarse interval
-_AROUND = 0.1  # [s] half the stretch of track that the fit looks at
-_STILL = 0.015  # [m] a part that rolls in place changes height by less than this
-
-
 def _refine(
-    tracks: _Tracks, point: str, support: Support, i: int, j: int, *, leaving: bool
+    tracks: _Tracks, point: str, support: Support, i: int, j: int, leaving: bool
 ) -> float:
     """Instant [s] at which a point comes to rest at the start of [i, j), or leaves.
 
@@ -478,24 +443,24 @@ def _refine(
     stillness. Over 0.1 s no path is so curved that more terms would tell.
     Leaving is the same seen backwards in time.
     """
-    demo, column = tracks.demo, tracks.demo.names.index(point)
-    raw, smooth = demo.position[:, column], tracks.position[:, column]
-    valid, n, rate = demo.valid[:, column], len(demo.t), demo.rate
+    demo, n = tracks.demo, len(tracks.demo.t)
+    raw, smooth, valid = demo.point(point), tracks.at(point), tracks.valid(point)
     if leaving:
         raw, smooth, valid = raw[::-1], smooth[::-1], valid[::-1]
         i, j = n - j, n - i
     if not valid[max(i - 1, 0)]:  # the view begins here, not the contact
         return float(demo.t[n - 1 - i] if leaving else demo.t[i])
-    ahead = min(i + round(_SEARCH * rate), (i + j) // 2)
-    raw_height, height = support.height(raw), support.height(smooth)
-    rest = np.median(raw_height[ahead : min(ahead + round(_REST * rate), j)])
+    around = tracks.samples(_AROUND)
+    ahead = min(i + tracks.samples(_SEARCH), (i + j) // 2)
+    resting = support.height(raw)[ahead : min(ahead + tracks.samples(_REST), j)]
     still = max(_STILL, 4.5 * _noise(raw) / 2.0)  # smoothing halves the noise
-    start = max(i - round(_AROUND * rate), 0)
-    away = height[start : ahead + 1] - rest > still  # no part rests above its place
+    start = max(i - around, 0)
+    # No part rests above its place.
+    away = support.height(smooth)[start : ahead + 1] - np.median(resting) > still
     moving = np.flatnonzero(away)
     k = start + int(moving[-1]) if len(moving) else i
-    k = _fit_instant(raw, min(k, ahead), round(_AROUND * rate))
-    return float(np.interp(n - 1 - k if leaving else k, np.arange(n), demo.t))
+    k = _fit_instant(raw, min(k, ahead), around)
+    return float(demo.t[n - 1 - k if leaving else k])
 
 
 def _noise(x: np.ndarray) -> float:
@@ -509,16 +474,21 @@ def _noise(x: np.ndarray) -> float:
 
 
 def _fit_instant(p: np.ndarray, k: int, half: int) -> int:
-    """Index within `half` of k at which rest begins, by least squares."""
+    """Index within `half` of k at which rest begins, by least squares.
+
+    For each index c in question the track (N, 3) is a constant and a multiple of
+    max(c - s, 0), both free; the one with the smallest residual is the answer.
+    """
     low, high = max(k - 3 * half // 2, 0), min(k + 4 * half + 1, len(p))
-    y, s = p[low:high], np.arange(low, high)
-    best = (np.inf, k)
-    for c in range(max(k - half, low + 3), min(k + half, high - 4) + 1):
-        A = np.stack([np.ones(len(s)), np.maximum(c - s, 0.0) / half], axis=1)
-        x, *_ = np.linalg.lstsq(A, y, rcond=None)
-        cost = float(np.sum((A @ x - y) ** 2))
-        best = min(best, (cost, c))
-    return best[1]
+    c = np.arange(max(k - half, low + 3), min(k + half, high - 4) + 1)
+    if not len(c):
+        return k
+    y = p[low:high] - p[low:high].mean(axis=0)
+    way = np.maximum(c[:, None] - np.arange(low, high), 0)  # (C, N)
+    way = way - way.mean(axis=1, keepdims=True)
+    slope = way @ y / np.sum(way**2, axis=1, keepdims=True)  # (C, 3)
+    left = y - way[:, :, None] * slope[:, None, :]
+    return int(c[np.argmin(np.sum(left**2, axis=(1, 2)))])
 
 
 def _limb_ends(demo: Demonstration, part: str) -> tuple[str, str]:
@@ -537,20 +507,19 @@ def _limb_ends(demo: Demonstration, part: str) -> tuple[str, str]:
 def _interval(
     tracks: _Tracks,
     part: str,
-    point: str,
     support: Support,
-    i: int,
-    j: int,
-    t: np.ndarray,
-    ends: tuple[str, str] | None = None,
+    span: tuple[int, int],
+    t0: float,
+    t1: float,
 ) -> ContactInterval:
-    """A contact with the pose it has over samples i to j, both included.
+    """A contact from t0 to t1 [s] with the pose it has over a span of samples.
 
     The place is the median of the part's reference point, on the support; the heading
-    is that from the first to the second of `ends`; without, the way the hips face.
+    is the limb's, that of a seat the way the hips face.
     """
+    point = "Pelvis" if part == SEAT else part
     ok = np.zeros(len(tracks.demo.t), dtype=bool)
-    ok[i : j + 1] = True
+    ok[span[0] : span[1] + 1] = True
     if np.any(ok & tracks.valid(point)):
         ok &= tracks.valid(point)
     p = np.median(tracks.demo.point(point)[ok], axis=0)
@@ -558,25 +527,23 @@ def _interval(
     A, b = support.edges()
     for row, limit in zip(A, b, strict=True):  # a wrist may hang over the edge
         p = p - row * max(float(row @ p - limit), 0.0)
-    if ends is None:
+    if part == SEAT:
         left = np.mean((tracks.at("LHip") - tracks.at("RHip"))[ok], axis=0)
         heading = np.array([left[1], -left[0], 0.0])
     else:
-        heading = np.mean((tracks.at(ends[1]) - tracks.at(ends[0]))[ok], axis=0)
+        base, tip = _limb_ends(tracks.demo, part)
+        heading = np.mean((tracks.at(tip) - tracks.at(base))[ok], axis=0)
+    R = frame_from_normal(support.normal, heading)
     contact = Contact(
-        surface=part,
-        support=support.name,
-        position=p,
-        quaternion=quat_from_matrix(frame_from_normal(support.normal, heading)),
+        surface=part, support=support.name, position=p, quaternion=quat_from_matrix(R)
     )
-    t0, t1 = float(t[0]), float(t[1])
     return ContactInterval(
-        part=part, is_surface=part != SEAT, t0=t0, t1=t1, contact=contact
+        part=part, is_surface=part != SEAT, t0=float(t0), t1=float(t1), contact=contact
     )
 
 
 def _stances(
-    tracks: _Tracks, intervals: list[ContactInterval], options: DetectOptions
+    tracks: _Tracks, intervals: list[ContactInterval]
 ) -> tuple[np.ndarray, tuple[Stance, ...]]:
     """Stances between the instants at which something changes.
 
@@ -584,41 +551,34 @@ def _stances(
     stance before goes on.
     """
     end = float(tracks.demo.t[-1])
-    changes = sorted({x for i in intervals for x in (i.t0, i.t1)} | {end})
     groups: list[list[float]] = []
-    for x in changes:
-        if groups and x - groups[-1][0] < options.merge:
+    for x in sorted({x for i in intervals for x in (i.t0, i.t1)} | {end}):
+        if groups and x - groups[-1][0] < tracks.options.merge:
             groups[-1].append(x)
         else:
             groups.append([x])
-    instant = {x: float(np.mean(g)) for g in groups for x in g}
-    for x in groups[0]:
-        instant[x] = groups[0][0]
-    for x in groups[-1]:
-        instant[x] = end
-    cuts = sorted(set(instant.values()))
+    means = [groups[0][0], *(float(np.mean(g)) for g in groups[1:-1]), end]
+    if len(groups) == 1:
+        means = [end]
+    instant = {x: m for g, m in zip(groups, means, strict=True) for x in g}
+    cuts = sorted(set(means))
+    by_part = sorted(intervals, key=lambda i: PARTS.index(i.part))
     times: list[float] = []
     held: list[tuple[Contact, ...]] = []
     for a, b in pairwise(cuts):
         now = tuple(
-            i.contact
-            for i in sorted(intervals, key=lambda i: PARTS.index(i.part))
-            if instant[i.t0] <= a and instant[i.t1] >= b
+            i.contact for i in by_part if instant[i.t0] <= a and instant[i.t1] >= b
         )
-        if not now or (held and [id(c) for c in now] == [id(c) for c in held[-1]]):
-            continue
-        times.append(a)
-        held.append(now)
+        if now and (not held or [*map(id, now)] != [*map(id, held[-1])]):
+            times.append(a)
+            held.append(now)
     times.append(cuts[-1])
-    stances = tuple(
-        Stance(
-            contacts=contacts,
-            posture=_posture(tracks, a, b),
-            pelvis=_pelvis(tracks, a, b),
-        )
-        for contacts, a, b in zip(held, times[:-1], times[1:], strict=True)
-    )
-    return np.array(times), stances
+    stances = []
+    for contacts, a, b in zip(held, times[:-1], times[1:], strict=True):
+        middle = _middle(tracks, a, b)
+        posture, pelvis = _posture(tracks, middle), _pelvis(tracks, middle)
+        stances.append(Stance(contacts=contacts, posture=posture, pelvis=pelvis))
+    return np.array(times), tuple(stances)
 
 
 def _middle(tracks: _Tracks, t0: float, t1: float) -> np.ndarray:
@@ -630,23 +590,20 @@ def _middle(tracks: _Tracks, t0: float, t1: float) -> np.ndarray:
     return middle
 
 
-def _pelvis(tracks: _Tracks, t0: float, t1: float) -> np.ndarray | None:
-    """Mean pose (7,) of the pelvis over the middle half of a stance, where seen.
+def _pelvis(tracks: _Tracks, middle: np.ndarray) -> np.ndarray | None:
+    """Mean pose (7,) of the pelvis over samples, where it is seen.
 
     Between the hips, y to the left one, z along the trunk as far as it is square to y:
     markers on hips and shoulders tell no more.
     """
     names = ("LHip", "RHip", "LShoulder", "RShoulder")
-    ok = _middle(tracks, t0, t1) & tracks.valid(*names)
+    ok = middle & tracks.valid(*names)
     if not ok.any():
         return None
-    hips, shoulders = (
-        [np.mean(tracks.at(n)[ok], axis=0) for n in pair]
-        for pair in (names[:2], names[2:])
-    )
-    y = hips[0] - hips[1]
+    left, right, *shoulders = (np.mean(tracks.at(n)[ok], axis=0) for n in names)
+    y = left - right
     y = y / np.linalg.norm(y)
-    position = np.mean(hips, axis=0)
+    position = np.mean([left, right], axis=0)
     z = np.mean(shoulders, axis=0) - position
     z = z - y * (y @ z)
     z = z / np.linalg.norm(z)
@@ -654,26 +611,24 @@ def _pelvis(tracks: _Tracks, t0: float, t1: float) -> np.ndarray | None:
     return np.concatenate([position, quat_from_matrix(R)])
 
 
-def _posture(tracks: _Tracks, t0: float, t1: float) -> dict[str, np.ndarray]:
-    """Mean directions of the segments over the middle half of a stance."""
-    middle = _middle(tracks, t0, t1)
-    segments: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-        "trunk": (("LHip", "RHip"), ("LShoulder", "RShoulder"))
-    }
+def _posture(tracks: _Tracks, middle: np.ndarray) -> dict[str, np.ndarray]:
+    """Mean directions of the segments over samples."""
+    segments = {"trunk": (("LHip", "RHip"), ("LShoulder", "RShoulder"))}
     for s, side in zip(SIDES, ("left", "right"), strict=True):
-        hand = wrist(tracks.demo.names, s)
-        segments[f"{side}_upper_arm"] = ((s + "Shoulder",), (s + "Elbow",))
-        segments[f"{side}_forearm"] = ((s + "Elbow",), (hand,))
-        segments[f"{side}_thigh"] = ((s + "Hip",), (s + "Knee",))
-        segments[f"{side}_shank"] = ((s + "Knee",), (s + "Foot",))
+        arm = (s + "Shoulder", s + "Elbow", wrist(tracks.demo.names, s))
+        leg = (s + "Hip", s + "Knee", s + "Foot")
+        for (a, b, c), upper, lower in (
+            (arm, "upper_arm", "forearm"),
+            (leg, "thigh", "shank"),
+        ):
+            segments[f"{side}_{upper}"] = ((a,), (b,))
+            segments[f"{side}_{lower}"] = ((b,), (c,))
     out = {}
     for name, (base, tip) in segments.items():
         ok = middle & tracks.valid(*base, *tip)
-        if not ok.any():
-            continue
-        ends = [
-            np.mean([tracks.at(n)[ok] for n in x], axis=(0, 1)) for x in (base, tip)
-        ]
-        direction = ends[1] - ends[0]
-        out[name] = direction / np.linalg.norm(direction)
+        if ok.any():
+            a, b = (
+                np.mean([tracks.at(n)[ok] for n in x], axis=(0, 1)) for x in (base, tip)
+            )
+            out[name] = (b - a) / np.linalg.norm(b - a)
     return out
