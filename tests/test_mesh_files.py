@@ -434,7 +434,8 @@ def test_feet_and_hands_are_found_in_meshes_of_any_form(tmp_path):
             text = text.replace(box, f'<mesh filename="{name}"/>')
         path = tmp_path / "small.urdf"
         path.write_text(text)
-        model = mujoco.MjModel.from_xml_string(propose_robot(path).mjcf)
+        proposal = propose_robot(path)
+        model = mujoco.MjModel.from_xml_string(proposal.mjcf, dict(proposal.files))
         soles.append([model.geom(f).size.tolist() for f in ("LFoot", "RFoot")])
     np.testing.assert_allclose(soles[1], soles[0], atol=1e-5)
     np.testing.assert_allclose(soles[2], soles[0], atol=1e-5)

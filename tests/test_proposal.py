@@ -13,14 +13,22 @@ import yaml
 
 import humanoids
 from clamber.errors import InputError
+from clamber.model.description import compile_description, read_description
 from clamber.model.kinematics import Kinematics
-from clamber.model.limbs import find_limbs, geom_points, geom_volume, joint_range
+from clamber.model.limbs import (
+    Tree,
+    find_limbs,
+    geom_points,
+    geom_volume,
+    joint_range,
+)
 from clamber.model.propose import FOREARM, UPPER_ARM, effort_of, propose_robot
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
 from clamber.planning.diagnose import check_robot
 from clamber.run.folder import save_proposal
+from test_description import CUBE, stl
 
 TEXTS = {"mjcf": humanoids.mjcf, "urdf": humanoids.urdf}
 SUFFIX = {"mjcf": "small.xml", "urdf": "small.urdf"}
@@ -71,7 +79,7 @@ def test_limbs_are_found(proposed):
 def test_the_built_in_robots_are_found_as_they_are_described(name):
     robot = load_robot(name)
     model = mujoco.MjModel.from_xml_path(str(robot.path))
-    found = find_limbs(model, name)
+    found = find_limbs(Tree(model, name))
     for limb, chain in found.limbs.items():
         assert model.body(chain.root).name == robot.limbs[limb].root
         assert model.body(chain.middle).name == robot.limbs[limb].middle
@@ -321,11 +329,11 @@ def test_a_flat_body_keeps_a_valid_inertia_when_written(tmp_path, moments):
     a, b = text.index("<inertia "), text.index("/>", text.index("<inertia "))
     x, y, z = (1e-2 * np.array(moments) / 3.0).tolist()
     flat = f'<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"'
-    proposal = propose_robot(described(tmp_path, "urdf", text[:a] + flat + text[b:]))
-    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
-    np.testing.assert_allclose(
-        sorted(model.body("k0").inertia), sorted([x, y, z]), rtol=1e-5
-    )
+    path = described(tmp_path, "urdf", text[:a] + flat + text[b:])
+    save_proposal(propose_robot(path), tmp_path)
+    world = build_world(load_robot(tmp_path / "robot.yaml"), Scene(start=np.zeros(3)))
+    kept = sorted(world.model.body("k0").inertia)
+    np.testing.assert_allclose(kept, sorted([x, y, z]), rtol=1e-4)
 
 
 def test_a_link_without_geometry_gets_some_and_a_note(tmp_path):
@@ -376,6 +384,43 @@ def test_a_robot_without_effort_limits_is_refused_by_name(proposed, tmp_path):
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(fields))
     with pytest.raises(InputError, match=r"effort\.\w+: expected its largest torque"):
         load_robot(tmp_path / "robot.yaml")
+
+
+def test_what_is_seen_of_a_robot_stays_where_it_is_and_is_only_seen(tmp_path):
+    """A foot's mesh becomes a box to collide with, and is drawn as it was."""
+    (tmp_path / "foot.stl").write_bytes(stl((10 * CUBE - 0.5) * [0.17, 0.08, 0.02]))
+    box, mesh = '<box size="0.17 0.08 0.02"/>', '<mesh filename="foot.stl"/>'
+    text = humanoids.urdf().replace(box, mesh)
+    path = described(tmp_path, "urdf", text)
+    proposal = propose_robot(path)
+    save_proposal(proposal, tmp_path / "robot")
+    robot = load_robot(tmp_path / "robot" / "robot.yaml")
+    there = compile_description(read_description(path), path)
+    here = mujoco.MjModel.from_xml_path(str(robot.path))
+    corners = []
+    for model in (there, here):
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        meshes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
+        # The base is where the robot stands: what counts is the place on its foot.
+        points = [geom_points(model, data, g) for g in meshes.tolist()]
+        foot = [data.xpos[model.geom_bodyid[g]] for g in meshes]
+        corners.append(
+            [
+                sorted((p - f).round(4).tolist())
+                for p, f in zip(points, foot, strict=True)
+            ]
+        )
+    np.testing.assert_allclose(corners[1], corners[0], atol=1e-4)
+    seen = here.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    assert not here.geom_contype[seen].any()
+    assert not here.geom_conaffinity[seen].any()
+    plain = propose_robot(described(tmp_path, "urdf"))
+    assert proposal.fields["effort"] == plain.fields["effort"]
+    world = build_world(robot, Scene(start=np.zeros(3)))
+    assert set(world.pairs.ravel().tolist()).isdisjoint(
+        np.flatnonzero(world.model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).tolist()
+    )
 
 
 def test_names_of_a_description_cannot_leave_the_folder(tmp_path):
@@ -532,7 +577,7 @@ def test_a_thumb_of_more_joints_than_a_finger_is_no_part_of_the_arm(tmp_path):
     text = text.replace("</mujoco>", f"<equality>{couplings}</equality></mujoco>")
     model = mujoco.MjModel.from_xml_string(text)
     mimics = {f"{t}h{i}": f"{t}g{i}" for t in "vw" for i in (-1, 0, 1, 9)}
-    found = find_limbs(model, "hands", mimics)
+    found = find_limbs(Tree(model, "hands", mimics))
     for side, tag in (("left", "v"), ("right", "w")):
         arm = found.limbs[f"{side}_arm"]
         assert model.body(arm.end).name == f"{tag}2"

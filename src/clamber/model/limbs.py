@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from clamber.errors import InputError
+from clamber.model.records import short_repr
 
 MIRRORED = 0.05  # share of the height: limbs this near to each other's mirror image
 LEAST_JOINTS = 3  # of a limb
@@ -51,6 +52,11 @@ class Chain:
     sign: float
     beyond: tuple[int, ...]
 
+    @property
+    def elbow(self) -> int:
+        """Id of the joint that folds it, elbow or knee."""
+        return self.joints[self.bend]
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Anatomy:
@@ -70,64 +76,180 @@ class Anatomy:
     locked: tuple[int, ...]
     forward: np.ndarray
 
+    __repr__ = short_repr
 
-def links_of(model: mujoco.MjModel) -> np.ndarray:
-    """(nb,) the first body of the link that each body is part of."""
-    out = np.arange(model.nbody)
-    for b in range(1, model.nbody):
-        if model.body_jntnum[b] == 0:
-            out[b] = out[model.body_parentid[b]]
-    return out
+    def pair(self, kind: str) -> list[Chain]:
+        """Left and right `arm` or `leg`."""
+        return [self.limbs[f"{side}_{kind}"] for side in ("left", "right")]
+
+    @property
+    def moving(self) -> list[int]:
+        """Ids of the joints of limbs and trunk, in the order of the model."""
+        return sorted(
+            [*self.trunk, *(j for c in self.limbs.values() for j in c.joints)]
+        )
 
 
-def find_limbs(
-    model: mujoco.MjModel, source: object, mimics: Mapping[str, str] | None = None
-) -> Anatomy:
-    """Find the limbs.
+class Tree:
+    """A description at its zero posture, and what hangs on what in it.
 
-    Args:
-        model: With one floating body, at its zero posture.
+    Attributes:
+        model: With one floating body.
+        data: Kinematics and centres of mass at the zero posture.
         source: Named in errors.
-        mimics: Joint that each coupled joint follows, by name: they move grippers.
+        links: (nb,) the first body of the link that each body is part of.
+        base: Body that floats.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        source: object,
+        mimics: Mapping[str, str] | None = None,
+    ) -> None:
+        """Look at the zero posture.
+
+        Args:
+            model: As above.
+            source: As above.
+            mimics: Joint that each coupled joint follows, by name: they move grippers.
+
+        Raises:
+            InputError: There is not one floating body.
+        """
+        self.model, self.source, self.data = model, source, mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self.data)
+        mujoco.mj_comPos(model, self.data)
+        self.links = np.arange(model.nbody)
+        for b in range(1, model.nbody):
+            if model.body_jntnum[b] == 0:
+                self.links[b] = self.links[model.body_parentid[b]]
+        free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        if len(free) != 1:
+            expected = "one floating body, the robot"
+            raise InputError(expected, source, "free joints", len(free))
+        self.root = int(free[0])
+        self.base = int(model.jnt_bodyid[self.root])
+        coupled = {*(mimics or {}), *(mimics or {}).values()}
+        alone = [
+            int(model.jnt_bodyid[j])
+            for j in range(model.njnt)
+            if model.joint(j).name not in coupled
+        ]
+        # Grippers: bodies on whose joints nothing hangs that moves on its own.
+        self._grips = {
+            b
+            for b in range(1, model.nbody)
+            if model.body_jntnum[b] and not any(self.hangs_on(x, b) for x in alone)
+        }
+
+    def name(self, joint: int) -> str:
+        """Of a joint."""
+        return self.model.joint(joint).name
+
+    def joints(self, body: int) -> list[int]:
+        """Ids of a body's joints."""
+        first = int(self.model.body_jntadr[body])
+        return list(range(first, first + int(self.model.body_jntnum[body])))
+
+    def hangs_on(self, body: int, ancestor: int) -> bool:
+        """Whether a body is another, or hangs on it."""
+        while body and body != ancestor:
+            body = int(self.model.body_parentid[body])
+        return body == ancestor
+
+    def below(self, body: int) -> list[int]:
+        """A body and all that hang on it."""
+        return [b for b in range(1, self.model.nbody) if self.hangs_on(b, body)]
+
+    def count(self, body: int) -> int:
+        """Joints of a body and of all that hang on it."""
+        return int(self.model.body_jntnum[self.below(body)].sum())
+
+    def children(self, link: int) -> list[int]:
+        """Bodies with joints that hang on a link."""
+        m = self.model
+        return [
+            b
+            for b in range(1, m.nbody)
+            if m.body_jntnum[b] and self.links[m.body_parentid[b]] == link and b != link
+        ]
+
+    def way_out(self, body: int) -> list[int]:
+        """Bodies with joints from one on, until the chain ends or becomes fingers."""
+        way = [body]
+        while True:
+            children = self.children(way[-1])
+            onward = [b for b in children if b not in self._grips]
+            if not onward:
+                return way
+            # Fingers are alike: the limb goes on where one child has most joints.
+            joints = [self.count(c) for c in onward]
+            if max(joints) < 0.6 * sum(self.count(c) for c in children):
+                return way
+            way.append(onward[int(np.argmax(joints))])
+
+    def points(
+        self, link: int, *, below: bool = False, data: mujoco.MjData | None = None
+    ) -> np.ndarray:
+        """(K, 3) points in the world on the geometry of a link.
+
+        Its collision geometry; what is only seen where it has none.
+
+        Args:
+            link: Its first body.
+            below: With the links that hang on it.
+            data: Another posture, with kinematics.
+        """
+        m = self.model
+        bodies = self.below(link) if below else []
+        geoms = [
+            g
+            for g in range(m.ngeom)
+            if self.links[m.geom_bodyid[g]] == link or int(m.geom_bodyid[g]) in bodies
+        ]
+        solid = [g for g in geoms if m.geom_contype[g] or m.geom_conaffinity[g]]
+        points = [geom_points(m, data or self.data, g) for g in solid or geoms]
+        return np.concatenate(points) if points else np.zeros((0, 3))
+
+    def far(self, chain: Chain, data: mujoco.MjData | None = None) -> np.ndarray:
+        """(3,) middle of a limb's end, away from its knee or elbow."""
+        data = data or self.data
+        points = self.points(int(self.links[chain.end]), below=True, data=data)
+        return points.mean(axis=0) if len(points) else data.xipos[chain.end]
+
+    def in_link(
+        self, link: int, p: np.ndarray, R: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A pose in the world at the zero posture as one in a link."""
+        R_WL = self.data.xmat[link].reshape(3, 3)
+        return R_WL.T @ (p - self.data.xpos[link]), R_WL.T @ R.reshape(3, 3)
+
+    def must_be_hinge(self, joint: int) -> None:
+        """Refuse other joints than hinges, by name."""
+        kind = mujoco.mjtJoint(int(self.model.jnt_type[joint]))
+        if kind != mujoco.mjtJoint.mjJNT_HINGE:
+            expected, where = "hinges alone in limbs and trunk", self.name(joint)
+            what = kind.name.removeprefix("mjJNT_").lower()
+            raise InputError(expected, self.source, f"joint {where!r}", what)
+
+
+def find_limbs(tree: Tree) -> Anatomy:
+    """Find the limbs.
 
     Raises:
         InputError: It has not two arms and two legs, or a limb has other than hinges.
     """
-    free = [
-        j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
-    ]
-    if len(free) != 1:
-        raise InputError(
-            "one floating body, the robot",
-            source=source,
-            field="free joints",
-            value=len(free),
-        )
-    base = int(model.jnt_bodyid[free[0]])
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    coupled = {*(mimics or {}), *(mimics or {}).values()}
-    free_moving = [
-        int(model.jnt_bodyid[j])
-        for j in range(model.njnt)
-        if model.joint(j).name not in coupled
-    ]
-    # Grippers: bodies on whose joints nothing hangs that moves on its own.
-    grips = frozenset(
-        b
-        for b in range(1, model.nbody)
-        if model.body_jntnum[b] and not any(hangs_on(model, x, b) for x in free_moving)
-    )
-    pairs = _paired(model, data, base, grips)
+    model, data = tree.model, tree.data
+    pairs = _paired(tree)
     if len(pairs) < 2:
         raise InputError(
             "two legs and two arms, mirror images of each other at the zero posture, z"
-            f" up, of {LEAST_JOINTS} joints or more ({_found(model, pairs)})",
-            source=source,
-            field="kinematic tree",
+            f" up, of {LEAST_JOINTS} joints or more ({_found(tree, pairs)})",
+            tree.source,
+            "kinematic tree",
         )
-    low = [min(data.xpos[_way_out(model, b, grips)[-1], 2] for b in p) for p in pairs]
+    low = [min(data.xpos[tree.way_out(b)[-1], 2] for b in p) for p in pairs]
     legs = pairs[int(np.argmin(low))]
     rest = [p for p in pairs if p is not legs]
     arms = max(rest, key=lambda p: float(model.body_subtreemass[list(p)].sum()))
@@ -135,10 +257,10 @@ def find_limbs(
     forward = np.cross([left[0], left[1], 0.0], [0.0, 0.0, 1.0])
     forward /= np.linalg.norm(forward)
     chains = {
-        name: [_chain(model, data, b, name, source, grips) for b in pair]
+        name: [_chain(tree, b, name) for b in pair]
         for name, pair in (("arm", arms), ("leg", legs))
     }
-    if _faces_back(model, data, chains["leg"], forward):
+    if _faces_back(tree, chains["leg"], forward):
         forward = -forward
         chains = {n: c[::-1] for n, c in chains.items()}
     across = np.cross([0.0, 0.0, 1.0], forward)
@@ -146,33 +268,34 @@ def find_limbs(
     for name, pair in chains.items():
         sides = sorted(pair, key=lambda c: -float(data.xpos[c.end] @ across))
         limbs[f"left_{name}"], limbs[f"right_{name}"] = sides
-    used = {j for c in limbs.values() for j in c.joints}
+    used = {j for c in limbs.values() for j in c.joints} | {tree.root}
     carrying = set()
     for chain in limbs.values():
         b = int(model.jnt_bodyid[chain.joints[0]])
         while b:
             b = int(model.body_parentid[b])
-            carrying |= set(_joints_of(model, b))
-    carrying -= used | {free[0]}
+            carrying |= set(tree.joints(b))
+    carrying -= used
     for j in carrying:
-        _must_be_hinge(model, j, source)
+        tree.must_be_hinge(j)
     return Anatomy(
-        base=base,
+        base=tree.base,
         limbs={n: limbs[n] for n in sorted(limbs)},
         trunk=tuple(sorted(carrying)),
-        locked=tuple(sorted(set(range(model.njnt)) - used - carrying - {free[0]})),
+        locked=tuple(sorted(set(range(model.njnt)) - used - carrying)),
         forward=forward,
     )
 
 
-def _found(model: mujoco.MjModel, pairs: list[tuple[int, int]]) -> str:
+def _found(tree: Tree, pairs: list[tuple[int, int]]) -> str:
     """Which limbs there are, and which joints are left that could make others."""
+    model = tree.model
     limbs = [b for p in pairs for b in p]
     rest = [
-        model.joint(j).name
+        tree.name(j)
         for j in range(model.njnt)
-        if model.jnt_type[j] != mujoco.mjtJoint.mjJNT_FREE
-        and not any(hangs_on(model, int(model.jnt_bodyid[j]), b) for b in limbs)
+        if j != tree.root
+        and not any(tree.hangs_on(int(model.jnt_bodyid[j]), b) for b in limbs)
     ]
     names = [f"{model.body(a).name} and {model.body(b).name}" for a, b in pairs]
     return (
@@ -182,133 +305,54 @@ def _found(model: mujoco.MjModel, pairs: list[tuple[int, int]]) -> str:
     )
 
 
-def _joints_of(model: mujoco.MjModel, body: int) -> list[int]:
-    first = int(model.body_jntadr[body])
-    return list(range(first, first + int(model.body_jntnum[body])))
-
-
-def _children(model: mujoco.MjModel) -> list[list[int]]:
-    out: list[list[int]] = [[] for _ in range(model.nbody)]
-    for b in range(1, model.nbody):
-        out[int(model.body_parentid[b])].append(b)
-    return out
-
-
-def _moving_children(model: mujoco.MjModel, link: int) -> list[int]:
-    """Bodies with joints that hang on a link, fixed bodies in between aside."""
-    links = links_of(model)
-    return [
-        b
-        for b in range(1, model.nbody)
-        if model.body_jntnum[b] and links[model.body_parentid[b]] == link and b != link
-    ]
-
-
-def _way_out(model: mujoco.MjModel, body: int, grips: frozenset[int]) -> list[int]:
-    """Bodies with joints from one on, until the chain ends or branches into fingers."""
-    way = [body]
-    while True:
-        children = _moving_children(model, way[-1])
-        onward = [b for b in children if b not in grips]
-        if not onward:
-            return way
-        # Fingers are alike: the limb goes on where one child has most of the joints.
-        joints = [_count(model, c) for c in onward]
-        if max(joints) < 0.6 * sum(_count(model, c) for c in children):
-            return way
-        way.append(onward[int(np.argmax(joints))])
-
-
-def _count(model: mujoco.MjModel, body: int) -> int:
-    """Joints of a body and of all that hangs on it."""
-    total = int(model.body_jntnum[body])
-    return total + sum(_count(model, c) for c in _children(model)[body])
-
-
-def _paired(
-    model: mujoco.MjModel, data: mujoco.MjData, base: int, grips: frozenset[int]
-) -> list[tuple[int, int]]:
+def _paired(tree: Tree) -> list[tuple[int, int]]:
     """First bodies of limbs that are mirror images, the legs' pair among them.
 
     Walks outwards from the base: where a body's children have mirror images among one
     another, they are limbs; the others are part of the trunk and are walked on.
     """
-    height = float(np.ptp(data.xipos[1:, 2])) or 1.0
-    pairs, trunk = [], [base]
+    pairs, trunk = [], [tree.base]
     while trunk:
-        link = trunk.pop()
-        children = _moving_children(model, link)
+        children = tree.children(trunk.pop())
         taken = set()
         for i, a in enumerate(children):
             for b in children[i + 1 :]:
-                if a in taken or b in taken or not _alike(model, data, a, b, height):
+                if a in taken or b in taken or not _alike(tree, a, b):
                     continue
                 taken |= {a, b}
-                if all(
-                    sum(int(model.body_jntnum[x]) for x in _way_out(model, c, grips))
-                    >= LEAST_JOINTS
-                    for c in (a, b)
-                ):
+                joints = [tree.model.body_jntnum[tree.way_out(c)].sum() for c in (a, b)]
+                if min(joints) >= LEAST_JOINTS:
                     pairs.append((a, b))
         trunk += [c for c in children if c not in taken]
     return pairs
 
 
-def _alike(
-    model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int, height: float
-) -> bool:
+def _alike(tree: Tree, a: int, b: int) -> bool:
     """Same joints, mass and height, and not in the same place."""
-    if _count(model, a) != _count(model, b):
+    if tree.count(a) != tree.count(b):
         return False
-    mass = model.body_subtreemass[[a, b]]
+    mass = tree.model.body_subtreemass[[a, b]]
     if abs(mass[0] - mass[1]) > 0.1 * mass.max():
         return False
-    p, q = data.subtree_com[a], data.subtree_com[b]
-    apart = float(np.linalg.norm((p - q)[:2]))
-    return abs(float(p[2] - q[2])) < MIRRORED * height and apart > MIRRORED * height
+    near = MIRRORED * (float(np.ptp(tree.data.xipos[1:, 2])) or 1.0)
+    p, q = tree.data.subtree_com[a], tree.data.subtree_com[b]
+    return abs(float(p[2] - q[2])) < near < float(np.linalg.norm((p - q)[:2]))
 
 
-def _must_be_hinge(model: mujoco.MjModel, joint: int, source: object) -> None:
-    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
-        kind = mujoco.mjtJoint(int(model.jnt_type[joint])).name
-        raise InputError(
-            "hinges alone in limbs and trunk",
-            source=source,
-            field=f"joint {model.joint(joint).name!r}",
-            value=kind.removeprefix("mjJNT_").lower(),
-        )
-
-
-def _chain(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    body: int,
-    name: str,
-    source: object,
-    grips: frozenset[int],
-) -> Chain:
+def _chain(tree: Tree, body: int, name: str) -> Chain:
     """The limb that begins with a body."""
-    way = _way_out(model, body, grips)
-    joints = [j for b in way for j in _joints_of(model, b)]
+    way = tree.way_out(body)
+    joints = [j for b in way for j in tree.joints(b)]
     for j in joints:
-        _must_be_hinge(model, j, source)
-    bend, sign = _bending(model, data, joints, way[-1])
-    middle = int(model.jnt_bodyid[joints[bend]])
+        tree.must_be_hinge(j)
+    bend, sign = _bending(tree, joints, way[-1])
+    middle = int(tree.model.jnt_bodyid[joints[bend]])
     before = way[: way.index(middle)]
     if not before:
-        raise InputError(
-            f"a joint between the trunk and the {name}'s middle joint",
-            source=source,
-            field=f"joint {model.joint(joints[bend]).name!r}",
-        )
-    mine = set(joints)
-    beyond = tuple(
-        j
-        for b in range(1, model.nbody)
-        if hangs_on(model, b, way[0])
-        for j in _joints_of(model, b)
-        if j not in mine
-    )
+        expected = f"a joint between the trunk and the {name}'s middle joint"
+        where = f"joint {tree.name(joints[bend])!r}"
+        raise InputError(expected, tree.source, where)
+    past = [j for b in tree.below(way[0]) for j in tree.joints(b)]
     return Chain(
         root=before[min(1, len(before) - 1)],
         middle=middle,
@@ -316,17 +360,8 @@ def _chain(
         joints=tuple(joints),
         bend=bend,
         sign=sign,
-        beyond=beyond,
+        beyond=tuple(j for j in past if j not in joints),
     )
-
-
-def hangs_on(model: mujoco.MjModel, body: int, ancestor: int) -> bool:
-    """Whether a body is another, or hangs on it."""
-    while body:
-        if body == ancestor:
-            return True
-        body = int(model.body_parentid[body])
-    return False
 
 
 def joint_range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
@@ -337,17 +372,16 @@ def joint_range(model: mujoco.MjModel, joint: int) -> tuple[float, float]:
     return low, high
 
 
-def _bending(
-    model: mujoco.MjModel, data: mujoco.MjData, joints: list[int], end: int
-) -> tuple[int, float]:
+def _bending(tree: Tree, joints: list[int], end: int) -> tuple[int, float]:
     """Which hinge is the knee or elbow, and which way it shortens the limb.
 
     That with the largest product of levers: distance of its axis from the limb's second
     joint, the middle of shoulder or hip, times that from its tip. A twist has none on
     one side, an ankle a short one.
     """
+    model, data = tree.model, tree.data
     first = data.xanchor[joints[1]]
-    points = link_points(model, data, end, below=True)
+    points = tree.points(end, below=True)
     if len(points) == 0:
         points = data.xipos[end][None]
     far = points[int(np.argmax(np.linalg.norm(points - first, axis=1)))]
@@ -358,58 +392,32 @@ def _bending(
 
     bend = int(np.argmax([lever(j, first) * lever(j, tip) for j in joints]))
     local = data.xmat[end].reshape(3, 3).T @ (tip - data.xpos[end])
-    turned = mujoco.MjData(model)
     angles = np.linspace(*joint_range(model, joints[bend]), SWEEP)
     lengths = []
     for angle in angles:
-        turned.qpos[:] = model.qpos0
-        turned.qpos[model.jnt_qposadr[joints[bend]]] = angle
-        mujoco.mj_kinematics(model, turned)
+        turned = _turned(model, joints[bend], float(angle))
         p = turned.xpos[end] + turned.xmat[end].reshape(3, 3) @ local
         lengths.append(float(np.linalg.norm(p - first)))
     fold = angles[int(np.argmin(lengths))] - angles[int(np.argmax(lengths))]
     return bend, float(np.sign(fold)) or 1.0
 
 
-def _faces_back(
-    model: mujoco.MjModel, data: mujoco.MjData, legs: list[Chain], forward: np.ndarray
-) -> bool:
+def _turned(model: mujoco.MjModel, joint: int, angle: float) -> mujoco.MjData:
+    """The zero posture but for one joint."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[joint]] = angle
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _faces_back(tree: Tree, legs: list[Chain], forward: np.ndarray) -> bool:
     """Whether the knees fold the feet forward: then forward is the other way."""
-    turned = mujoco.MjData(model)
     out = 0.0
     for leg in legs:
-        knee = leg.joints[leg.bend]
-        low, high = joint_range(model, knee)
-        turned.qpos[:] = model.qpos0
-        turned.qpos[model.jnt_qposadr[knee]] = high if leg.sign > 0 else low
-        mujoco.mj_kinematics(model, turned)
-        out += float((turned.xpos[leg.end] - data.xpos[leg.end]) @ forward)
+        low, high = joint_range(tree.model, leg.elbow)
+        turned = _turned(tree.model, leg.elbow, high if leg.sign > 0 else low)
+        out += float((turned.xpos[leg.end] - tree.data.xpos[leg.end]) @ forward)
     return out > 0
-
-
-def link_points(
-    model: mujoco.MjModel, data: mujoco.MjData, body: int, *, below: bool = False
-) -> np.ndarray:
-    """(K, 3) points in the world on the geometry of a link.
-
-    Its collision geometry; what is only seen where it has none.
-
-    Args:
-        model: The description.
-        data: With kinematics.
-        body: First body of the link.
-        below: With the links that hang on it.
-    """
-    links = links_of(model)
-    geoms = [
-        g
-        for g in range(model.ngeom)
-        if links[model.geom_bodyid[g]] == body
-        or (below and hangs_on(model, int(model.geom_bodyid[g]), body))
-    ]
-    solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-    points = [geom_points(model, data, g) for g in solid or geoms]
-    return np.concatenate(points) if points else np.zeros((0, 3))
 
 
 def geom_points(

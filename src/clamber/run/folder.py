@@ -52,6 +52,7 @@ from clamber.model.propose import Proposal, robot_yaml
 from clamber.model.robot import LIMBS, ROBOTS, Limb, Robot, RobotFile
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
+from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
 from clamber.planning.records import Iteration, Midway, Plan, PlanOptions
 from clamber.planning.substitutes import Replanned
@@ -970,13 +971,14 @@ def _with_assets(world: World, folder: Path) -> str:
 
 
 def save_proposal(proposal: Proposal, folder: str | Path) -> None:
-    """Write `robot.yaml` and the model that it names into a folder."""
-    for name, text in (
-        (proposal.fields["model"], proposal.mjcf),
-        (ROBOT, robot_yaml(proposal)),
-    ):
+    """Write `robot.yaml`, the model that it names, and meshes into a folder."""
+    files = {f"{MESH_FOLDER}/{n}": content for n, content in proposal.files.items()}
+    files[proposal.fields["model"]] = proposal.mjcf.encode()
+    files[ROBOT] = robot_yaml(proposal).encode()
+    for name, content in files.items():
+        (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
         with _whole(Path(folder) / name) as stream:
-            stream.write(text.encode())
+            stream.write(content)
 
 
 def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
