@@ -132,8 +132,7 @@ def _named_recording(sequence: ContactSequence | None, run: Run) -> str | None:
 def _show_recording(page: Page, skeleton: Skeleton) -> None:
     """A recording alone."""
     figure, demo = Figure(page.server, skeleton, np.zeros(3)), skeleton.demo
-    points = thinned(skeleton.position, 60).reshape(-1, 3)
-    page.look(points, float(demo.scene.start[2]), FOVY)
+    page.look(figure.seen(), float(demo.scene.start[2]), FOVY)
     page.watch(figure.show)
     page.span(float(demo.t[0]), float(demo.t[-1]), skeleton.changes())
 
@@ -148,13 +147,12 @@ class _RunPage:
         self._figure = None
         self._put(plan, run.rollout)
         world = self._stage.motion.world
-        points = seen_points(Kinematics(world), self._stage.motion.q)
+        self._points = seen_points(Kinematics(world), self._stage.motion.q)
         if skeleton is not None:
             person = thinned(skeleton.position, 60).reshape(-1, 3)
-            offset = beside(world.scene, points, skeleton.demo.scene, person)
+            offset = beside(world.scene, self._points, skeleton.demo.scene, person)
             self._figure = Figure(page.server, skeleton, offset)
-        fovy = float(world.model.vis.global_.fovy)
-        page.look(points, float(world.scene.start[2]), fovy)
+        self._look()
         with page.layers:
             for name in LAYERS:
                 if name != PERSON_LAYER or skeleton is not None:
@@ -183,15 +181,23 @@ class _RunPage:
 
     def _toggle(self, name: str) -> None:
         """A checkbox for one of the layers."""
-        box, clock = (
-            self._page.server.gui.add_checkbox(name, LAYERS[name]),
-            self._page.clock,
-        )
+        clock = self._page.clock
+        box = self._page.server.gui.add_checkbox(name, LAYERS[name])
 
         @box.on_update
         def _(_: Any) -> None:
             self._layers[name] = bool(box.value)
             clock.go(clock.t, playing=clock.playing)
+            if name == PERSON_LAYER:
+                self._look()
+
+    def _look(self) -> None:
+        """Have the cameras take in the robot, and the person where it is shown."""
+        points, world = self._points, self._stage.motion.world
+        if self._figure is not None and self._layers[PERSON_LAYER]:
+            points = np.concatenate([points, self._figure.seen()])
+        fovy = float(world.model.vis.global_.fovy)
+        self._page.look(points, float(world.scene.start[2]), fovy)
 
     def _show(self, t: float) -> str:
         if self._figure is not None:

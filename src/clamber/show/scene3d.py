@@ -30,11 +30,13 @@ from clamber.show.sample import (
     row_at,
     sample_motion,
     support_polygon_at,
+    thinned,
 )
 from clamber.show.skeleton import Skeleton
 
 # One level of meshes, at rest and in motion, that a processor draws in time too.
 TRIANGLES, DEVIATION = 15_000, 0.0008  # [m] that faces may be off a round geom
+ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
 GHOST, GHOST_OPACITY, SEE_THROUGH = (59, 130, 246), 0.3, 0.45
 BALANCE, PUSH, WAY = (37, 99, 235), (162, 28, 175), (124, 58, 237)
 PERSON, PERSON_BOX = (144, 172, 201), (203, 188, 165)
@@ -81,10 +83,22 @@ class Bodies:
         for frame, pose in zip(self._frames, poses, strict=True):
             frame.position, frame.wxyz = pose[:3], pose[3:]
 
+    def show(self, which: np.ndarray) -> None:
+        """Have only some of them, (nb,) bool, to be seen."""
+        for frame, on in zip(self._frames, which.tolist(), strict=True):
+            frame.visible = on
+
     def fade(self, opacity: float | None) -> None:
         """How much of them is to be seen; None: all."""
         for part in self._parts:
             part.opacity = opacity
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(nb,) whether bodies with poses (nb, 7) can be told from those of others."""
+    cosine = np.minimum(np.abs(np.sum(a[:, 3:] * b[:, 3:], axis=1)), 1.0)
+    off = np.linalg.norm(a[:, :3] - b[:, :3], axis=1)
+    return (off > ALIKE) | (2 * np.arccos(cosine) > ALIKE_TURNED)
 
 
 class Discs:
@@ -179,13 +193,9 @@ class Stage:
     def show(self, t: float, layers: Mapping[str, bool]) -> str:
         """Send what differs from the last time; figures of this one, as HTML."""
         m, kin, row = self.motion, self._kin, row_at(self.motion.time, t)
-        if self._ghost is not None and m.reference is not None:
-            self._ghost.root.visible = layers["planned posture"]
-            if layers["planned posture"]:
-                kin.update(posture_at(m, m.reference, t))
-                self._ghost.pose(body_poses(kin.data, self._meshes))
         kin.update(posture_at(m, m.q, t))
-        self._robot.pose(body_poses(kin.data, self._meshes))
+        poses = body_poses(kin.data, self._meshes)
+        self._robot.pose(poses)
         self._robot.fade(SEE_THROUGH if layers["see-through robot"] else None)
         supports = list(m.world.supports.values())
         found = [
@@ -203,6 +213,13 @@ class Stage:
         facts = [f"{t:.2f} of {self.duration:.1f} s; {self.change_at(t)}"]
         if math.isfinite(m.margin[row]):
             facts.append(f"centre of mass {1000 * m.margin[row]:.0f} mm inside")
+        if self._ghost is not None and m.reference is not None:
+            self._ghost.root.visible = layers["planned posture"]
+            if layers["planned posture"]:
+                kin.update(posture_at(m, m.reference, t))
+                planned = body_poses(kin.data, self._meshes)
+                self._ghost.pose(planned)
+                self._ghost.show(apart(planned, poses))
         return paragraphs(facts)
 
     def _show_arrows(self, row: int, t: float, on: bool) -> None:
@@ -254,7 +271,7 @@ class Figure:
             skeleton: The recording.
             offset: (3,) where its world is put [m].
         """
-        add, self._skeleton = server.scene, skeleton
+        add, self._skeleton, self._offset = server.scene, skeleton, offset
         self.root = add.add_frame("/person", show_axes=False, position=offset)
         for i, box in enumerate(skeleton.demo.scene.boxes):
             add.add_box(
@@ -270,6 +287,10 @@ class Figure:
         )
         self._head = add.add_icosphere("/person/head", radius=HEAD, color=PERSON)
         self._discs = Discs(add, "/person/contacts", 16)
+
+    def seen(self) -> np.ndarray:
+        """(n, 3) points that a camera has to have in view [m]."""
+        return thinned(self._skeleton.position, 60).reshape(-1, 3) + self._offset
 
     def show(self, t: float) -> str:
         """Put the person where it is; bones that were not seen are not shown."""
