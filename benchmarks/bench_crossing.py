@@ -75,7 +75,7 @@ def cross(
     except clamber.InputError as e:
         return out | {"planned": False, "reached": False, "why": str(e)}
     spent = time.process_time() - began
-    changes = len(plan.paths)
+    changes = len(plan.changes)
     out |= {
         **{"planned": plan.complete, "changes": changes},
         "plan_s_per_change": f"{spent / max(changes, 1):.3f}",

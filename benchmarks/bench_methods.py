@@ -20,21 +20,22 @@ import numpy as np
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.planning.planner import plan
-from clamber.planning.records import Method, Plan, PlanOptions
+from clamber.planning.records import Plan, PlanOptions
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
+from clamber.step.change import Method
 
 
 def table(result: Plan) -> None:
     print(f"  {'keyframe':34}{'iterations':>11}{'before':>9}{'after':>9}  status")
-    for key, path in zip(result.keyframes[1:], result.paths, strict=True):
+    for change in result.changes:
+        key = change.keyframe
         print(
-            f"  {path.transition.step!s:34}{key.iterations:11d}"
+            f"  {change.step!s:34}{key.iterations:11d}"
             f"{key.cost_before:9.4f}{key.cost_after:9.4f}  {key.status.name.lower()}"
         )
-    for s in result.skipped:
-        if s.missed:
-            print(f"  missed: {s.reason}")
+    for failure in result.failures:
+        print(f"  missed: {failure}")
 
 
 def main() -> None:
@@ -51,10 +52,10 @@ def main() -> None:
         print(f"\n{method}")
         table(result)
         costs = np.array([(k.cost_before, k.cost_after) for k in keys]).reshape(-1, 2)
-        share = result.timings.get("keyframes", 0.0)
+        share = result.timings["search"]
         iterations = sum(k.iterations for k in keys)
         rows.append((method, total, share, len(keys), iterations, *costs.sum(axis=0)))
-    print(f"\n{'method':10}{'total':>9}{'postures':>10}{'made':>6}", end="")
+    print(f"\n{'method':10}{'total':>9}{'search':>10}{'made':>6}", end="")
     print(f"{'iterations':>12}{'before':>9}{'after':>9}")
     for method, total, share, made, iterations, before, after in rows:
         print(

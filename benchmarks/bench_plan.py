@@ -39,7 +39,7 @@ def main() -> None:
         runs.append({**result.timings, "total": time.perf_counter() - start})
     seconds = result.trajectory.time[-1] if result.trajectory else 0.0
     print(
-        f"climb onto {HEIGHT} m, {len(result.paths)} contact changes, {seconds:.0f} s"
+        f"climb onto {HEIGHT} m, {len(result.changes)} contact changes, {seconds:.0f} s"
         f" of motion, {'complete' if result.complete else 'INCOMPLETE'}"
     )
     print(f"{'stage':14}{'median [s]':>12}{'min':>8}{'max':>8}")
@@ -48,7 +48,8 @@ def main() -> None:
         print(
             f"{stage:14}{statistics.median(took):12.3f}{min(took):8.3f}{max(took):8.3f}"
         )
-    per_change = statistics.median(r["total"] for r in runs) / max(len(result.paths), 1)
+    total = statistics.median(r["total"] for r in runs)
+    per_change = total / max(len(result.changes), 1)
     print(f"{'per change':14}{per_change:12.3f}")
     print(f"peak memory {peak_memory():.0f} MB")
 

@@ -49,7 +49,7 @@ def measure(policy: Path, length: float) -> Row:
         clamber.save_plan(plan, folder)
     clock.append(time.process_time())
     spent, saving = np.diff(clock).tolist()
-    t, changes = plan.trajectory, len(plan.paths)
+    t, changes = plan.trajectory, len(plan.changes)
     return {
         "length_m": length,
         "changes": changes,

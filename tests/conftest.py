@@ -133,7 +133,7 @@ def fast_plan(demo_plan):
 
     from clamber.planning.planner import timed
 
-    trajectory = timed(demo_plan.world, demo_plan.paths, "max")
+    trajectory = timed(demo_plan.world, demo_plan.changes, "max")
     options = replace(demo_plan.options, speed="max")
     return replace(demo_plan, options=options, trajectory=trajectory)
 
@@ -145,13 +145,13 @@ def hands_plan(demo_plan):
 
     from clamber.planning.planner import timed
 
-    paths, stances = demo_plan.paths[:2], demo_plan.sequence.stances
+    changes, stances = demo_plan.changes[:2], demo_plan.sequence.stances
     down = [
         i
         for i, stance in enumerate(stances)
         if {"LHand", "RHand"} <= set(stance.surfaces)
     ]
-    trajectory = timed(demo_plan.world, paths, "max")
+    trajectory = timed(demo_plan.world, changes, "max")
     return replace(
         demo_plan,
         options=replace(demo_plan.options, speed="max"),
@@ -160,10 +160,25 @@ def hands_plan(demo_plan):
             stances=stances[: down[0] + 1],
             t=demo_plan.sequence.t[: down[0] + 2],
         ),
-        keyframes=demo_plan.keyframes[:3],
-        paths=paths,
+        changes=changes,
         trajectory=trajectory,
     )
+
+
+@pytest.fixture(scope="session")
+def demo_paths(demo_plan):
+    """What the contact changes were made of: their transitions and paths."""
+    from clamber.step.ik import IK
+    from clamber.step.path import plan_path
+    from clamber.step.transition import plan_transition
+
+    ik, keys, out = IK(demo_plan.world), demo_plan.keyframes, []
+    for before, after, change in zip(keys, keys[1:], demo_plan.changes, strict=False):
+        transition = plan_transition(
+            ik, before, after, change.step, margin=change.margin
+        )
+        out.append(plan_path(ik, transition))
+    return out
 
 
 @pytest.fixture(scope="session")

@@ -17,15 +17,15 @@ from clamber.planning.adaptation import (
     FEELING_SPEED,
     FOLLOWED,
     REACH,
-    Adapted,
     adapt_plan,
     feeling,
     from_here,
     go_on,
     start_again,
 )
-from clamber.planning.records import Midway
+from clamber.planning.records import State
 from clamber.planning.trajectory import HOLD_START, RATE, holding_torque
+from clamber.step.change import Failure
 from clamber.step.ik import IK
 from clamber.step.stability import contact_drift, contact_points
 from clamber.step.statics import com_margin, support_polygon
@@ -40,7 +40,7 @@ def made_at(plan, step):
     before = {c.surface for c in plan.keyframes[step].stance}
     made = next(c for c in after if c.surface not in before)
     held = tuple(c for c in after if c is not made)
-    return made, held, plan.paths[step].transition.touching
+    return made, held, plan.changes[step].touching
 
 
 def depths(world: World, t, contact, normal, every: int = 20) -> np.ndarray:
@@ -69,13 +69,19 @@ def as_felt(contacts, offset, on="box"):
     )
 
 
-def midway(made, contacts, q, loaded=None) -> Midway:
-    loaded = contacts if loaded is None else loaded
-    return Midway(made=made, contacts=tuple(contacts), loaded=tuple(loaded), q=q)
+def midway(done, stance, q, loaded=None) -> State:
+    loaded = stance if loaded is None else loaded
+    return State(done=done, stance=tuple(stance), loaded=tuple(loaded), q=q)
 
 
 def described(contacts) -> list[str]:
     return [f"{c.surface}@{c.support}" for c in contacts]
+
+
+def cut(plan, missed: str, n: int):
+    """The first `n` changes, and why there are no more, if anything is missed."""
+    failures = (Failure(status=Status.STUCK, detail=missed),) if missed else ()
+    return replace(plan, changes=plan.changes[:n], failures=failures)
 
 
 # Feeling for a contact.
@@ -135,7 +141,6 @@ def test_feeling_is_slow_and_begins_and_ends_at_rest(demo_plan, step):
     # Nothing is held before or after: it is felt for at once.
     assert np.abs(t.v[100]).max() > 1e-3
     assert np.abs(t.v[-100]).max() > 1e-3
-    assert t.velocity_error(world) < 1e-2
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -222,7 +227,7 @@ def test_the_first_keyframe_has_the_contacts_that_were_felt(felt):
 
 def test_all_steps_that_are_left_are_planned_to_the_last_stance(fast_plan, felt):
     _, _, found = felt
-    assert found.missed == ""
+    assert found.complete
     assert len(found.keyframes) == len(fast_plan.keyframes) - 2
     last, planned = found.keyframes[-1].stance, fast_plan.keyframes[-1].stance
     assert sorted(described(last)) == sorted(described(planned))
@@ -252,7 +257,6 @@ def test_the_new_trajectory_passes_through_the_new_keyframes(felt):
         assert np.abs(kin.difference(t.q[k], key.q)).max() < 1e-6
         closed = {s for s, c in zip(t.surfaces, t.contact[k], strict=True) if c}
         assert {c.surface for c in key.stance} <= closed
-    assert t.velocity_error(found.world) < 0.05
 
 
 def test_it_goes_on_from_what_is_commanded_and_from_the_base_as_measured(fast_plan):
@@ -297,7 +301,7 @@ def test_with_no_steps_left_there_is_still_the_way_to_a_good_posture(fast_plan):
     scene = moved_world(fast_plan.world, offset).scene
     contacts = as_felt(key.stance, offset)
     found = adapt_plan(fast_plan, scene, midway(6, contacts, key.q), key.q)
-    assert found.missed == ""
+    assert found.complete
     assert described(found.keyframes[0].stance) == described(contacts)
     assert len(found.keyframes) == 1
     kin = Kinematics(found.world)
@@ -313,8 +317,8 @@ def test_a_stance_that_cannot_be_is_said_to_be_none(fast_plan):
         fast_plan, fast_plan.world.scene, midway(0, contacts, key.q), key.q
     )
     assert found.trajectory is None
-    assert found.keyframes == ()
-    assert found.missed.startswith("no stable posture here: ")
+    assert str(found.failures[0]).startswith("no stable posture here: ")
+    assert found.start.status is found.failures[0].status
 
 
 def test_a_step_that_has_no_way_is_named(fast_plan, monkeypatch):
@@ -323,7 +327,7 @@ def test_a_step_that_has_no_way_is_named(fast_plan, monkeypatch):
     key = fast_plan.keyframes[0]
     scene = moved_world(fast_plan.world, (3.0, 0.0, 0.0)).scene
     found = adapt_plan(fast_plan, scene, midway(0, key.stance, key.q), key.q)
-    assert found.missed.startswith("air -> LHand on box: ")
+    assert str(found.failures[0]).startswith("air -> LHand on box: ")
     assert len(found.keyframes) < len(fast_plan.keyframes)
 
 
@@ -333,16 +337,13 @@ def test_a_support_that_is_believed_gone_is_the_reason(fast_plan):
     found = adapt_plan(fast_plan, scene, midway(0, key.stance, key.q), key.q)
     assert found.trajectory is None
     assert len(found.keyframes) == 1
-    assert "box" in found.missed
+    assert "box" in str(found.failures[0])
 
 
 def test_where_there_is_no_way_at_the_distance_of_what_is_rough_it_is_not_kept(
     fast_plan, monkeypatch
 ):
     world, asked = fast_plan.world, []
-
-    def found(missed, keyframes):
-        return Adapted(world=world, trajectory=None, keyframes=keyframes, missed=missed)
 
     answers = {}
 
@@ -354,22 +355,24 @@ def test_where_there_is_no_way_at_the_distance_of_what_is_rough_it_is_not_kept(
     box = world.scene.boxes[0]
     rough = replace(world.scene, boxes=(replace(box, roughness=0.03),))
     arguments = (midway(0, (), world.home), world.home)
-    keys = fast_plan.keyframes
 
-    answers = {True: found("", keys), False: found("no", keys)}
+    def found(missed, n):
+        return cut(fast_plan, missed, n)
+
+    answers = {True: found("", 6), False: found("no", 6)}
     assert adapt_plan(fast_plan, rough, *arguments) is answers[True]
     assert asked == [0.03]
-    answers = {True: found("no", keys[:2]), False: found("", keys)}
+    answers = {True: found("no", 1), False: found("", 6)}
     assert adapt_plan(fast_plan, rough, *arguments) is answers[False]
     assert asked == [0.03, 0.03, 0.0]
     # Neither goes all the way: the one that goes farther, else the careful one.
-    answers = {True: found("no", keys[:2]), False: found("not", keys[:3])}
+    answers = {True: found("no", 1), False: found("not", 2)}
     assert adapt_plan(fast_plan, rough, *arguments) is answers[False]
-    answers = {True: found("no", keys[:3]), False: found("not", keys[:3])}
+    answers = {True: found("no", 2), False: found("not", 2)}
     assert adapt_plan(fast_plan, rough, *arguments) is answers[True]
     # A smooth scene is not asked about twice.
     asked.clear()
-    answers = {False: found("no", keys[:2])}
+    answers = {False: found("no", 1)}
     assert adapt_plan(fast_plan, world.scene, *arguments) is answers[False]
     assert asked == [0.0]
 
@@ -378,25 +381,26 @@ def test_a_policy_goes_on_with_what_leans_kept_farther_off_where_that_can_be(
     fast_plan, monkeypatch
 ):
     world, keys, asked = fast_plan.world, fast_plan.keyframes, []
+
+    def found(missed, n):
+        return cut(fast_plan, missed, n)
+
     pair = next(set(p) for p in world.pairs if world.support_geom["box"] in p)
     (leaning,) = pair - {world.support_geom["box"]}
     wary = {(int(leaning), "box"): 0.03}
 
-    def found(missed, keyframes):
-        return Adapted(world=world, trajectory=None, keyframes=keyframes, missed=missed)
-
-    def stub(plan, ik, made, key, lead):
+    def stub(plan, ik, key):
         asked.append(bool(ik._wary.any()))
         return answers[asked[-1]]
 
     monkeypatch.setattr(adaptation, "_rest", stub)
-    answers = {True: found("", keys), False: found("", keys)}
+    answers = {True: found("", 6), False: found("", 6)}
     assert go_on(fast_plan, world, keys[-1], wary) is answers[True]
     assert asked == [True]
-    answers = {True: found("no", keys[:2]), False: found("", keys)}
+    answers = {True: found("no", 1), False: found("", 6)}
     assert go_on(fast_plan, world, keys[-1], wary) is answers[False]
     assert asked == [True, True, False]
-    answers = {True: found("no", keys[:2]), False: found("no", keys[:2])}
+    answers = {True: found("no", 1), False: found("no", 1)}
     assert go_on(fast_plan, world, keys[-1], wary) is answers[True]
     # Where nothing leans nothing is asked about twice.
     asked.clear()
@@ -411,7 +415,7 @@ def test_from_another_start_the_whole_plan_is_made_anew(fast_plan):
     scene = fast_plan.world.scene
     start = scene.start + np.array([0.02, -0.03, 0.05])
     found = start_again(fast_plan, replace(scene, start=start))
-    assert found.missed == ""
+    assert found.complete
     assert len(found.keyframes) == len(fast_plan.keyframes)
     home = build_world(fast_plan.world.robot, replace(scene, start=start)).home
     assert np.array_equal(found.keyframes[0].q, home)
@@ -469,9 +473,9 @@ def test_only_the_first_move_of_a_limb_is_another(demo_plan):
     later = hand[-1]
     new = from_here([later, later], other, world)
     assert [s.breaks for s in new] == [("LElbow",), later.breaks]
-    # A limb that is in the air breaks nothing, whatever is below it.
+    # One that should be in the air, and is not, lets go of what it is on.
     (air,) = from_here([hand[0]], other, world)
-    assert hand[0].breaks == air.breaks == ()
+    assert (hand[0].breaks, air.breaks) == ((), ("LElbow",))
 
 
 @pytest.mark.parametrize("step", STEPS)

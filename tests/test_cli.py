@@ -19,6 +19,7 @@ from rich.console import Console
 import clamber
 from clamber import cli
 from clamber.cli import commands, output
+from clamber.contact.steps import Skipped
 from clamber.execution.events import Lost
 from clamber.execution.verdict import Figure
 from support.files import write_take
@@ -246,14 +247,16 @@ def stages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         cost_before=0.805,
         cost_after=0.125,
     )
-    move = SimpleNamespace(transition=SimpleNamespace(step="air -> LHand on table"))
-    skipped = SimpleNamespace(stance=3, reason="out of reach [0.4 m]", missed=True)
+    change = SimpleNamespace(step="air -> LHand on table")
+    skipped = Skipped(stance=3, reason="out of reach [0.4 m]")
     plan = SimpleNamespace(
         keyframes=(keyframe, keyframe),
-        paths=(move,),
+        changes=(change,),
         skipped=(skipped,),
+        failures=(),
+        why_not=skipped.reason,
         complete=True,
-        instead="",
+        fallback=None,
         trajectory="timed",
     )
     event = Lost(time=7.25, surface="LHand")
@@ -396,10 +399,8 @@ def test_a_plan_without_any_move_is_not_simulated(
 def test_an_incomplete_plan_gives_the_reason_of_the_first_move_missed(
     stages: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ):
-    merged = SimpleNamespace(stance=5, reason="left leg in the air", missed=False)
     reason = "LFoot -> LKnee on table: too high"
-    missed = SimpleNamespace(stance=6, reason=reason, missed=True)
-    stages.plan.skipped, stages.plan.complete = (merged, missed), False
+    stages.plan.why_not, stages.plan.complete = reason, False
     stages.verdict.reached = False
     for command in (["climb"], ["plan", "sequence.json"]):
         assert cli.main(command) == 1

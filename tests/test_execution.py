@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from clamber.errors import Status
 from clamber.execution import executive as execution
 from clamber.execution import simulation
 from clamber.execution.disturbance import Disturbance
@@ -47,8 +48,10 @@ from clamber.execution.simulation import (
 from clamber.execution.verdict import END_SPEED, Figure, judge, measure
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
-from clamber.planning.adaptation import FEELING_SPEED, REACH, Adapted
+from clamber.planning.adaptation import FEELING_SPEED, REACH
+from clamber.planning.records import Plan
 from clamber.planning.trajectory import HOLD_END, HOLD_START
+from clamber.step.change import Failure
 
 EXACT = {"noise": 0.0, "delay": 0.0}
 TOP = 0.275  # [m] the box that was planned for
@@ -750,17 +753,20 @@ def test_resting_holds_the_reference_without_velocity(pilot):
 
 
 NOTHING = "no way"
+NO_WAY = Failure(status=Status.STUCK, detail=NOTHING)
 
 
-def nothing_found(world) -> Adapted:
-    return Adapted(world=world, trajectory=None, keyframes=(), missed=NOTHING)
+def nothing_found(pilot) -> Plan:
+    return replace(
+        pilot._plan, changes=(), trajectory=None, complete=False, failures=(NO_WAY,)
+    )
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
 def test_where_no_other_plan_is_found_the_one_at_hand_may_do(pilot, share):
     """As far as contacts are not too far off; else it stays where it is."""
     pilot._i = pilot._legs[0].end
-    exhaust(pilot._follow(nothing_found(pilot._world), share * FALLBACK))
+    exhaust(pilot._follow(nothing_found(pilot), share * FALLBACK))
     if share < 1:
         assert [str(e) for e in pilot.events] == [f"goes on as planned ({NOTHING})"]
         assert pilot.stopped == ""
@@ -771,19 +777,14 @@ def test_where_no_other_plan_is_found_the_one_at_hand_may_do(pilot, share):
 
 def test_with_all_steps_made_there_is_no_need_of_another_plan(pilot):
     pilot._made = len(pilot._steps)
-    exhaust(pilot._follow(nothing_found(pilot._world), 1.0))
+    exhaust(pilot._follow(nothing_found(pilot), 1.0))
     assert pilot.stopped == ""
     assert pilot._leg == len(pilot._legs)
     assert [str(e) for e in pilot.events] == [f"stays in this stance ({NOTHING})"]
 
 
 def test_a_plan_without_a_step_is_no_plan(pilot, hands_plan):
-    found = Adapted(
-        world=pilot._world,
-        trajectory=hands_plan.trajectory,
-        keyframes=hands_plan.keyframes[:1],
-        missed=NOTHING,
-    )
+    found = replace(hands_plan, changes=(), complete=False, failures=(NO_WAY,))
     exhaust(pilot._follow(found, 1.1 * FALLBACK))
     assert pilot.stopped == NOTHING
 
@@ -793,11 +794,12 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
 ):
     """And its end is said when it is reached."""
     t = hands_plan.trajectory
-    found = Adapted(
-        world=pilot._world,
+    found = replace(
+        hands_plan,
         trajectory=replace(t, keyframes=t.keyframes[:2]),
-        keyframes=hands_plan.keyframes[:2],
-        missed=NOTHING,
+        changes=hands_plan.changes[:1],
+        complete=False,
+        failures=(NO_WAY,),
     )
     exhaust(pilot._follow(found, 0.9 * FALLBACK))
     assert [str(e) for e in pilot.events] == [f"goes on as planned ({NOTHING})"]

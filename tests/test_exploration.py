@@ -12,20 +12,19 @@ from clamber.contact.contact import region_of
 from clamber.contact.policy import DemoPolicy
 from clamber.contact.scaling import retarget
 from clamber.contact.steps import split_moves
-from clamber.errors import InputError
+from clamber.errors import InputError, Status
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
 from clamber.planning import free as exploration
 from clamber.planning.free import (
     Bounds,
-    Reached,
     Stop,
     action_counts,
     explore,
     policy_counts,
 )
-from clamber.planning.records import PlanOptions
-from clamber.step.change import standing
+from clamber.planning.records import PlanOptions, Route
+from clamber.step.change import Failure, standing
 from clamber.step.ik import IK
 from clamber.step.stability import contact_drift
 
@@ -47,16 +46,17 @@ def tried(monkeypatch):
 
     def fail(ik, before, step, *rest):
         moves.append(step)
-        return "no"
+        return Failure(status=Status.COLLIDING, step=step)
 
-    monkeypatch.setattr(exploration, "plan_step", fail)
+    monkeypatch.setattr(exploration, "change_contact", fail)
     return moves
 
 
 def search(ik, goal, counts=None, start=None, **bounds):
     counts = action_counts(goal, ik.world) if counts is None else counts
-    start = None if start is None else Reached(keyframes=(start,))
-    return explore(ik, goal, PlanOptions(), counts, Bounds(**bounds), start=start)
+    options = PlanOptions()
+    start = Route(start=standing(ik, options.keyframe) if start is None else start)
+    return explore(ik, goal, options, counts, Bounds(**bounds), start)
 
 
 def test_actions_are_counted_in_the_regions_in_which_they_are_taken(goal, ik):
@@ -91,15 +91,15 @@ def found(ik, goal):
 def test_a_way_up_is_found_on_a_box_that_can_be_climbed(found):
     assert found.stop is Stop.FOUND
     assert 0 < found.states <= found.tries <= Bounds().tries
-    assert region_of(found.keyframes[-1].stance) == "O"
-    assert len(found.keyframes[-1].stance) == 4  # a surface of each limb
+    assert region_of(found.route.keyframes[-1].stance) == "O"
+    assert len(found.route.keyframes[-1].stance) == 4  # a surface of each limb
 
 
 def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, ik):
     steps, skipped = split_moves(found.sequence, ik.world)
     assert skipped == []
-    for step, path in zip(steps, found.paths, strict=True):
-        move = path.transition.step
+    for step, change in zip(steps, found.route.changes, strict=True):
+        move = change.step
         assert step.breaks == move.breaks
         assert step.makes.surface == move.makes.surface
         assert np.allclose(step.makes.position, move.makes.position)
@@ -110,7 +110,7 @@ def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, 
 
 
 def test_every_keyframe_that_is_found_closes_its_contacts_and_holds(found, ik):
-    for key in found.keyframes:
+    for key in found.route.keyframes:
         ik.kin.update(key.q)
         assert key.equilibrium.feasible
         assert max(contact_drift(ik.kin, c) for c in key.stance) < 1e-3
@@ -119,7 +119,7 @@ def test_every_keyframe_that_is_found_closes_its_contacts_and_holds(found, ik):
 def test_the_same_search_finds_the_same(found, ik, goal):
     again = search(ik, goal)
     assert (again.states, again.tries) == (found.states, found.tries)
-    for a, b in zip(again.keyframes, found.keyframes, strict=True):
+    for a, b in zip(again.route.keyframes, found.route.keyframes, strict=True):
         assert np.array_equal(a.q, b.q)
 
 
@@ -127,7 +127,7 @@ def test_where_the_robot_is_there_already_nothing_is_planned(
     ik, goal, demo_plan, tried
 ):
     there = search(ik, goal, start=demo_plan.keyframes[-1])
-    assert (there.stop, there.tries, there.paths) == (Stop.FOUND, 0, ())
+    assert (there.stop, there.tries, there.route.changes) == (Stop.FOUND, 0, ())
     assert len(there.sequence.stances) == 1
     almost = search(ik, goal, start=demo_plan.keyframes[-2], tries=3)
     assert almost.stop is Stop.TRIES
@@ -202,7 +202,7 @@ def test_a_search_ends_when_everything_within_its_bounds_is_tried(ik, goal, trie
     assert ended.states == 1
     assert ended.tries == len(tried)
     assert ended.sequence is None
-    assert len(ended.keyframes) == 1
+    assert ended.route.changes == ()
     moves = [
         (m.breaks, m.makes.surface, m.makes.support, *m.makes.position.round(3))
         for m in tried
@@ -222,28 +222,24 @@ def test_without_moves_there_is_nothing(ik, goal, tried):
 
 def test_no_sequence_is_longer_than_allowed(ik, goal, demo_plan, monkeypatch):
     """Every step is possible, and none gets there."""
-    key, path = demo_plan.keyframes[0], demo_plan.paths[0]
-    monkeypatch.setattr(exploration, "plan_step", lambda *a: (key, path))
+    change = replace(demo_plan.changes[0], keyframe=demo_plan.start)
+    monkeypatch.setattr(exploration, "change_contact", lambda *a: change)
     ended = search(ik, goal, tries=10_000, depth=2)
     assert ended.stop is Stop.EXHAUSTED
 
 
 def test_what_is_gone_on_from_is_part_of_what_is_found(ik, goal, demo_plan):
     """Five steps are made: one more gets there, and that is all that depth counts."""
-    steps = tuple(split_moves(goal, ik.world)[0][:5])
-    made = Reached(
-        keyframes=demo_plan.keyframes[:6], paths=demo_plan.paths[:5], steps=steps
-    )
+    made = Route(start=demo_plan.start, changes=demo_plan.changes[:5])
     counts = action_counts(goal, ik.world)
-    ended = explore(
-        ik, goal, PlanOptions(), counts, Bounds(tries=20, depth=1), start=made
-    )
+    bounds = Bounds(tries=20, depth=1)
+    ended = explore(ik, goal, PlanOptions(), counts, bounds, made)
     assert ended.stop is Stop.FOUND
-    assert len(ended.paths) == 6
-    assert ended.keyframes[:6] == demo_plan.keyframes[:6]
+    assert len(ended.route.changes) == 6
+    assert ended.route.changes[:5] == made.changes
     again = split_moves(ended.sequence, ik.world)[0]
     surfaces = [s.makes.surface for s in again]
-    assert surfaces[:5] == [s.makes.surface for s in steps]
+    assert surfaces[:5] == [c.step.makes.surface for c in made.changes]
     assert surfaces[5] == "RKnee"
 
 
@@ -254,9 +250,12 @@ def test_the_last_step_to_the_feet_rises_and_no_other_does(ik, goal, monkeypatch
     key = standing(ik, PlanOptions().keyframe)
     states = [replace(key.contacts[0], contact=c) for c in (*feet, hand)]
     steps = []
-    monkeypatch.setattr(
-        exploration, "plan_step", lambda ik, key, step, *rest: steps.append(step) or ""
-    )
+
+    def refuse(ik, key, step, *rest):
+        steps.append(step)
+        return Failure(status=Status.COLLIDING, step=step)
+
+    monkeypatch.setattr(exploration, "change_contact", refuse)
     search(ik, upright, start=replace(key, contacts=tuple(states)), tries=1000)
     assert any(s.makes is None for s in steps)
     for s in steps:
@@ -322,4 +321,4 @@ def test_a_box_too_high_for_all_alternatives_has_a_way_up(coman, demo_sequence):
     ik = IK(build_world(coman, Scene.from_height(0.62)))
     found = search(ik, retarget(demo_sequence, ik.world))
     assert found.stop is Stop.FOUND
-    assert region_of(found.keyframes[-1].stance) == "O"
+    assert region_of(found.route.keyframes[-1].stance) == "O"

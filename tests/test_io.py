@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import mujoco
@@ -289,13 +289,10 @@ def test_a_missing_sequence_is_one_sentence(tmp_path: Path):
 def test_a_plan_survives_the_disk(plan: Plan, saved: Path):
     back = io.load_plan(saved)
     assert plan.complete
-    assert same(back.keyframes, plan.keyframes)
-    assert same(back.trajectory, plan.trajectory)
-    assert same(back.skipped, plan.skipped)
-    assert asdict(back.options) == asdict(plan.options)
-    assert same(back.sequence.stances, plan.sequence.stances)
-    assert back.complete == plan.complete
-    assert back.timings == plan.timings
+    for field in fields(Plan):
+        if field.name != "world":
+            a, b = getattr(back, field.name), getattr(plan, field.name)
+            assert same(a, b), field.name
 
 
 def test_the_world_of_a_loaded_plan_is_the_one_that_planned(plan: Plan, saved: Path):
@@ -352,7 +349,7 @@ def test_the_plan_names_what_it_was_made_of(plan: Plan, saved: Path):
     assert all(len(h) == 64 for h in content["inputs"].values())
     assert content["prefixes"]["LKnee"] == "LKnee"
     assert str(ROBOTS) not in (saved / "plan.json").read_text()
-    assert content["moves"][0]["makes"]["surface"] == "LHand"
+    assert content["changes"][0]["step"]["makes"]["surface"] == "LHand"
     key = content["keyframes"][-1]
     assert {c["surface"] for c in key["contacts"]} == {"LFoot", "RFoot", "LHand"}
     for c in key["contacts"]:
@@ -409,7 +406,7 @@ def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path
         residuals=replace(plan.keyframes[-1].residuals, com_margin=-np.inf),
     )
     skipped = (Skipped(stance=4, reason="out of reach"),)
-    io.save_plan(replace(plan, keyframes=(key,), skipped=skipped), tmp_path)
+    io.save_plan(replace(plan, start=key, changes=(), skipped=skipped), tmp_path)
     assert "Infinity" not in (tmp_path / io.PLAN).read_text()
     back = io.load_plan(tmp_path)
     assert same(back.keyframes[0], key)

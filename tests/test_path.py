@@ -26,6 +26,7 @@ from clamber.step.path import (
 from clamber.step.posture import CLEARANCE
 from clamber.step.stability import contact_drift, contact_points
 from clamber.step.statics import com_margin, support_polygon
+from clamber.step.transition import plan_transition
 
 
 @pytest.fixture(scope="module")
@@ -145,12 +146,12 @@ def test_straight_up_needs_no_bulge():
 # The paths of the demonstration.
 
 
-def test_every_path_of_the_demonstration_is_solved(demo_plan):
-    assert [p.status for p in demo_plan.paths] == [Status.SOLVED] * 6
+def test_every_path_of_the_demonstration_is_solved(demo_paths):
+    assert [p.status for p in demo_paths] == [Status.SOLVED] * 6
 
 
-def test_end_points_are_the_postures_of_the_transition(demo_plan):
-    for path in demo_plan.paths:
+def test_end_points_are_the_postures_of_the_transition(demo_paths):
+    for path in demo_paths:
         t, (shift, swing, settle) = path.transition, path.phases
         assert [p.kind for p in path.phases] == ["shift", "swing", "settle"]
         for a, b in (
@@ -165,12 +166,12 @@ def test_end_points_are_the_postures_of_the_transition(demo_plan):
 
 
 def test_each_path_begins_where_the_last_one_ended(demo_plan):
-    for a, b in itertools.pairwise(demo_plan.paths):
+    for a, b in itertools.pairwise(demo_plan.changes):
         assert np.array_equal(a.phases[-1].q[-1], b.phases[0].q[0])
 
 
 def test_contacts_stay_in_place_at_and_between_all_postures(demo_plan, demo_kinematics):
-    for path in demo_plan.paths:
+    for path in demo_plan.changes:
         for phase in path.phases:
             for q in halves(demo_kinematics, phase.q):
                 demo_kinematics.update(q)
@@ -179,7 +180,7 @@ def test_contacts_stay_in_place_at_and_between_all_postures(demo_plan, demo_kine
 
 
 def test_contacts_neither_leave_nor_enter_their_supports(demo_plan, demo_kinematics):
-    for path in demo_plan.paths:
+    for path in demo_plan.changes:
         for phase in path.phases:
             for q in halves(demo_kinematics, phase.q):
                 demo_kinematics.update(q)
@@ -192,7 +193,7 @@ def test_contacts_neither_leave_nor_enter_their_supports(demo_plan, demo_kinemat
 def test_the_centre_of_mass_stays_over_the_contacts_that_bear_load(
     demo_plan, demo_kinematics
 ):
-    for path in demo_plan.paths:
+    for path in demo_plan.changes:
         for phase in path.phases:
             load = {c.surface: c for c in (*phase.load_before, *phase.load_after)}
             for q in phase.q:
@@ -203,8 +204,8 @@ def test_the_centre_of_mass_stays_over_the_contacts_that_bear_load(
 
 
 def test_the_moving_surface_follows_its_arc(demo_plan, demo_kinematics):
-    for path in demo_plan.paths:
-        made, swing = path.transition.step.makes, path.phases[1]
+    for path in demo_plan.changes:
+        made, swing = path.step.makes, path.phases[1]
         normal = demo_kinematics.world.supports[made.support].normal
         way = []
         for q in swing.q:
@@ -218,12 +219,11 @@ def test_the_moving_surface_follows_its_arc(demo_plan, demo_kinematics):
 def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinematics):
     """All pairs but those of closed contacts, by MuJoCo's distances."""
     world = demo_kinematics.world
-    for path in demo_plan.paths:
-        t = path.transition
+    for path in demo_plan.changes:
         for phase in path.phases:
             # At its very ends the moving surface touches what it leaves and meets.
             closed = phase.contacts
-            ends = (*closed, *t.leaving, t.step.makes)
+            ends = (*closed, *path.leaving, path.step.makes)
             inner, outer = apart(world, closed), apart(world, ends)
             for i, q in enumerate(phase.q):
                 demo_kinematics.update(q)
@@ -232,9 +232,9 @@ def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinemat
                 assert near.distance.min(initial=0.0) > -4e-3
 
 
-def test_gaps_are_halved_where_a_contact_drifts(demo_plan, ik, monkeypatch):
+def test_gaps_are_halved_where_a_contact_drifts(demo_paths, ik, monkeypatch):
     """From no posture at all between shift, touch and settle."""
-    t = demo_plan.paths[-1].transition
+    t = demo_paths[-1].transition
 
     def worst() -> tuple[float, int]:
         shift = plan_path(ik, t).phases[0]
@@ -257,8 +257,8 @@ def test_gaps_are_halved_where_a_contact_drifts(demo_plan, ik, monkeypatch):
 # Collisions and how they are found.
 
 
-def test_a_swing_straight_through_the_box_is_refused(demo_plan, ik):
-    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.step.breaks)
+def test_a_swing_straight_through_the_box_is_refused(demo_paths, ik):
+    path = next(p for p in demo_paths if "LFoot" in p.transition.step.breaks)
     swing = path.phases[1]
     # The right shank, which has no business on the box, goes through its edge.
     sunk = swing.q.copy()
@@ -270,8 +270,8 @@ def test_a_swing_straight_through_the_box_is_refused(demo_plan, ik):
     assert "(swing)" in note
 
 
-def test_an_open_contact_is_refused(demo_plan, ik):
-    path = demo_plan.paths[2]
+def test_an_open_contact_is_refused(demo_paths, ik):
+    path = demo_paths[2]
     lifted = path.phases[0].q.copy()
     lifted[:, 2] += 0.03
     broken = (replace(path.phases[0], q=lifted), *path.phases[1:])
@@ -280,9 +280,9 @@ def test_an_open_contact_is_refused(demo_plan, ik):
     assert note == "a contact opens by 30 mm (shift)"
 
 
-def test_a_swing_that_weak_joints_do_not_hold_is_refused(demo_plan, ik):
+def test_a_swing_that_weak_joints_do_not_hold_is_refused(demo_paths, ik):
     """What the contacts that stay ask of the joints half-way, not at the ends alone."""
-    path = demo_plan.paths[-1]
+    path = demo_paths[-1]
     assert check_phases(ik, path.phases, path.transition)[0] is Status.SOLVED
     weak = IK(replace(ik.world, tau_max=0.1 * ik.world.tau_max))
     status, _ = check_phases(weak, path.phases, path.transition)
@@ -318,13 +318,16 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
 ):
     """Figure 4.16: the knees on their way up a high box."""
     result = plan(demo_sequence, coman, Scene.from_height(0.52))
-    knees = [p for p in result.paths if "leg" in p.transition.step.limb]
+    knees = [k for k, c in enumerate(result.changes) if "leg" in c.step.limb]
     assert len(knees) == 2
     ik = IK(result.world)
     entered = []
-    for path in knees:
-        limb, made = path.transition.step.limb, path.transition.step.makes
-        plain = plan_path(ik, path.transition, adapt=False).phases[1].q
+    for k in knees:
+        path = result.changes[k]
+        limb, made = path.step.limb, path.step.makes
+        keys = result.keyframes[k : k + 2]
+        t = plan_transition(ik, *keys, path.step, margin=path.margin)
+        plain = plan_path(ik, t, adapt=False).phases[1].q
         entered.append(min(limb_to_box(result.world, q, limb) for q in plain[1:-1]))
         for q in path.phases[1].q:
             distance = limb_to_box(result.world, q, limb)
@@ -336,11 +339,11 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
     assert min(entered) < -5e-3  # the right knee: 21 mm into the box
 
 
-def test_where_little_moves_a_bridge_has_no_postures_between(demo_plan, ik):
-    t = demo_plan.paths[0].transition
+def test_where_little_moves_a_bridge_has_no_postures_between(demo_paths, ik):
+    t = demo_paths[0].transition
     small = np.zeros(ik.world.model.nv)
     small[ik.world.dadr[0]] = 0.01
     near = ik.kin.integrate(t.before, small)
     assert len(path_module.bridge(ik, t.before, near, t.held, t.held)) == 2
-    far = max(p.phases[0].q.shape[0] for p in demo_plan.paths)
+    far = max(p.phases[0].q.shape[0] for p in demo_paths)
     assert far > 2

@@ -21,7 +21,7 @@ from clamber.execution.events import Lost, Stopped
 from clamber.execution.simulation import STRIDE, Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
-from clamber.planning.records import Plan
+from clamber.planning.records import Fallback, Plan
 from clamber.run import folder as io
 from clamber.show import report
 
@@ -201,7 +201,9 @@ def test_a_plan_that_got_no_trajectory_shows_its_keyframes(plan: Plan, tmp_path:
 
 
 def test_a_plan_with_other_contacts_says_so(plan: Plan, tmp_path: Path):
-    io.save_plan(replace(plan, instead="hands instead of elbows"), tmp_path)
+    io.save_plan(
+        replace(plan, fallback=Fallback(reason="hands instead of elbows")), tmp_path
+    )
     assert report.run_record(tmp_path)["instead"] == "hands instead of elbows"
     io.save_plan(plan, tmp_path)
     assert report.run_record(tmp_path)["instead"] == ""

@@ -31,7 +31,7 @@ from clamber.step.statics import cone_generators
 
 @pytest.fixture(scope="module")
 def knee_phases(demo_plan):
-    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.step.breaks)
+    path = next(p for p in demo_plan.changes if "LFoot" in p.step.breaks)
     return path.phases
 
 

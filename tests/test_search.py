@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +16,10 @@ from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import build_world
 from clamber.planning import search
 from clamber.planning.planner import plan
-from clamber.planning.search import plan_steps, repairs
-from clamber.step import change
-from clamber.step.change import plan_step, standing
+from clamber.planning.records import PlanOptions, Route
+from clamber.planning.search import follow_steps, repairs
+from clamber.step import change as change_module
+from clamber.step.change import Change, Failure, change_contact, standing
 from clamber.step.ik import IK
 from clamber.step.posture import KeyframeOptions
 from clamber.step.transition import MARGINS, MOVED
@@ -28,12 +28,9 @@ OPTIONS = KeyframeOptions()
 HEIGHT = 0.275
 
 
-def quiet(*_: object) -> None:
-    """No timing, no progress."""
-
-
-def find(ik, steps, method="direct"):
-    return plan_steps(ik, steps, method, OPTIONS, lap=quiet, report=quiet)
+def find(ik, steps):
+    start = standing(ik, OPTIONS)
+    return follow_steps(ik, start, steps, PlanOptions(), lambda *_: None)
 
 
 def surfaces(keyframe) -> set[str]:
@@ -85,13 +82,11 @@ def test_who_rises_stands_as_at_first_and_else_stays_bent(ik, steps):
     step = replace(steps[0], breaks=("LHand",), makes=None, fixed=False)
     away = []
     for stands_up in (False, True):
-        again = plan_step(
-            ik, key, replace(step, stands_up=stands_up), "direct", OPTIONS, quiet
-        )
-        assert not isinstance(again, str)
-        assert surfaces(again[0]) == {"LFoot", "RFoot"}
+        again = change_contact(ik, key, replace(step, stands_up=stands_up), OPTIONS)
+        assert isinstance(again, Change)
+        assert surfaces(again.keyframe) == {"LFoot", "RFoot"}
         joints = ik.world.qadr
-        away.append(np.abs(again[0].q - ik.world.home)[joints].max())
+        away.append(np.abs(again.keyframe.q - ik.world.home)[joints].max())
     assert away[0] > 0.3
     assert away[1] < 0.1
 
@@ -124,24 +119,26 @@ def test_feet_stand_where_the_scene_says_and_turned_as_it_says(coman, yaw):
 def test_a_step_out_of_reach_is_skipped_with_its_reason_and_the_rest_goes_on(ik, steps):
     far = moved(steps[1], support="far", position=np.array([4.0, 0.0, 0.4]))
     found = find(ik, [steps[0], far, steps[1]])
-    assert [m.stance for m in found.missed] == [far.stance]
-    assert found.missed[0].reason.startswith("air -> RHand on far: ")
-    assert Status.UNREACHABLE.value in found.missed[0].reason
-    assert len(found.keyframes) == len(found.paths) + 1 == 3
+    (failure,) = found.failures
+    assert failure.step is far
+    assert failure.status is Status.UNREACHABLE
+    assert str(failure).startswith("air -> RHand on far: ")
+    assert not found.arrived
+    assert len(found.keyframes) == len(found.changes) + 1 == 3
     assert surfaces(found.keyframes[-1]) == {"LFoot", "RFoot", "LHand", "RHand"}
     assert {c.support for c in found.keyframes[-1].stance} == {"ground", "box"}
 
 
 def test_a_move_that_leaves_nothing_to_stand_on_is_refused(ik, steps):
     step = Step(limb="left_leg", breaks=("LFoot", "RFoot"), makes=None)
-    reason = plan_step(ik, standing(ik, OPTIONS), step, "direct", OPTIONS, quiet)
-    assert reason == "LFoot, RFoot -> air: nothing else bears load"
+    failure = change_contact(ik, standing(ik, OPTIONS), step, OPTIONS)
+    assert str(failure) == "LFoot, RFoot -> air: nothing else bears load"
 
 
 def test_nothing_to_do_finds_the_start_alone(ik):
     found = find(ik, [])
-    assert len(found.keyframes) == 1
-    assert found.paths == found.missed == ()
+    assert found.arrived
+    assert found.changes == found.failures == ()
 
 
 def test_a_firm_contact_is_made_where_it_is_wanted(ik, steps):
@@ -175,12 +172,12 @@ def test_a_badly_placed_knee_is_put_elsewhere_for_the_other_ones_sake(
     tangled = [*steps[:4], moved(steps[4], position=bad, fixed=True), steps[5]]
     monkeypatch.setattr(search, "MAX_REPAIRS", 0)
     stuck = find(ik, tangled)
-    assert [m.reason.split(":")[0] for m in stuck.missed] == ["RFoot -> RKnee on box"]
+    assert [str(f.step) for f in stuck.failures] == ["RFoot -> RKnee on box"]
     assert "RFoot" in surfaces(stuck.keyframes[-1])
 
     monkeypatch.undo()
     mended = find(ik, tangled)
-    assert mended.missed == ()
+    assert mended.arrived
     assert surfaces(mended.keyframes[-1]) >= {"LElbow", "RElbow", "LKnee", "RKnee"}
     left, before = (
         next(c.position for c in found.keyframes[5].stance if c.surface == "LKnee")
@@ -194,39 +191,31 @@ def test_no_repair_is_proposed_where_nothing_stands_on_a_contact_that_was_made(
     ik, steps
 ):
     start = standing(ik, OPTIONS)
-    assert list(repairs(ik, [start], [], steps[0])) == []
-
-
-class FakePath(str):
-    """A name with a margin."""
-
-    def __new__(cls, name, margin):
-        path = super().__new__(cls, f"path of {name}")
-        path.transition = SimpleNamespace(margin=margin)
-        return path
+    assert list(repairs(ik, Route(start=start), steps[0])) == []
 
 
 class FakePlanner:
-    """Stands in for `plan_step` and `repairs`: names instead of postures."""
+    """Stands in for `change_contact` and `repairs`: names instead of postures."""
 
     def __init__(
         self, monkeypatch, fails, repairs_to, margin=lambda name, tried: MARGINS[0]
     ):
         self.fails, self.repairs_to, self.tried = fails, repairs_to, []
         self.margin = margin
-        monkeypatch.setattr(search, "plan_step", self.plan_step)
+        monkeypatch.setattr(search, "change_contact", self.change_contact)
         monkeypatch.setattr(search, "repairs", self.repairs)
 
-    def plan_step(self, ik, before, step, method, options, lap):
+    def change_contact(self, ik, before, step, options, method):
         name = step.limb + ("!" if step.fixed else "")
         self.tried.append(name)
         if self.fails(name, self.tried):
-            return f"{name} fails"
-        return name, FakePath(name, self.margin(name, self.tried))
+            return Failure(status=Status.COLLIDING, detail=name)
+        margin = self.margin(name, self.tried)
+        return Change(step=step, keyframe=name, phases=(), margin=margin)
 
-    def repairs(self, ik, keyframes, paths, step, margin=MARGINS[-1]):
+    def repairs(self, ik, route, step, margin=MARGINS[-1]):
         self.asked = margin
-        better = self.repairs_to(step.limb, paths)
+        better = self.repairs_to(step.limb, route.changes)
         return iter([] if better is None else [better])
 
 
@@ -247,8 +236,7 @@ def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
     assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
     assert found.keyframes[1:] == ("a!", "b", "c", "d")
-    assert found.paths == tuple(f"path of {n}" for n in ("a!", "b", "c", "d"))
-    assert found.missed == ()
+    assert found.arrived
 
 
 def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
@@ -260,7 +248,7 @@ def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert fake.tried.count("b") == search.MAX_REPAIRS + 1
-    assert [m.reason for m in found.missed] == ["b fails"]
+    assert [str(f) for f in found.failures] == ["b"]
     assert found.keyframes[1:] == ("a!", "c")
 
 
@@ -273,7 +261,7 @@ def test_a_skipped_step_between_does_not_confuse_which_step_is_mended(ik, monkey
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert fake.tried == ["a", "b", "c", "b!", "c"]
-    assert [m.reason for m in found.missed] == ["a fails"]
+    assert [str(f) for f in found.failures] == ["a"]
     assert found.keyframes[1:] == ("b!", "c")
 
 
@@ -286,7 +274,7 @@ def test_a_step_skipped_before_and_after_a_repair_is_reported_once(ik, monkeypat
         lambda limb, paths: None if limb == "b" else ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 1), ("c", 2)))
-    assert [m.reason for m in found.missed] == ["b fails"]
+    assert [str(f) for f in found.failures] == ["b"]
 
 
 def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
@@ -298,7 +286,7 @@ def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert found.keyframes[1:] == ("a!", "b", "c")
-    assert found.missed == ()
+    assert found.arrived
 
 
 def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(ik, monkeypatch):
@@ -313,8 +301,7 @@ def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(ik, monkeypatch)
     assert fake.asked == MARGINS[0]
     assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
     assert found.keyframes[1:] == ("a!", "b", "c", "d")
-    assert found.paths == tuple(f"path of {n}" for n in ("a!", "b", "c", "d"))
-    assert [p.transition.margin for p in found.paths] == [MARGINS[0]] * 4
+    assert [c.margin for c in found.changes] == [MARGINS[0]] * 4
 
 
 @pytest.mark.parametrize("worse", ["a!", "b"])
@@ -328,7 +315,7 @@ def test_no_step_loses_its_margin_to_another_one(ik, monkeypatch, worse):
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
     assert found.keyframes[1:] == ("a", "b", "c")
-    assert [p.transition.margin for p in found.paths] == [*MARGINS[:1] * 2, MARGINS[-1]]
+    assert [c.margin for c in found.changes] == [*MARGINS[:1] * 2, MARGINS[-1]]
 
 
 def test_a_step_with_a_small_margin_counts_where_others_would_be_missed(
@@ -342,22 +329,22 @@ def test_a_step_with_a_small_margin_counts_where_others_would_be_missed(
         lambda name, tried: MARGINS[name == "c"],
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
-    assert found.missed == ()
+    assert found.arrived
     assert found.keyframes[1:] == ("a", "b", "c")
 
 
 def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkeypatch):
+    """And where those do not do either, the reason is that of flat feet."""
     tried = []
 
-    def planner(ik, before, step, held, method, options, lap):
+    def refuse(ik, before, step, held, *rest):
         tried.append(held)
-        flat = all(c.edge is None for c in held)
-        return "too far" if flat else ("keyframe", "path")
+        yield replace(before, status=list(Status)[len(tried)])
 
-    monkeypatch.setattr(change, "_plan_on", planner)
+    monkeypatch.setattr(change_module, "_keyframes", refuse)
     start = standing(ik, OPTIONS)
-    found = plan_step(ik, start, steps[0], "direct", OPTIONS, quiet)
-    assert found == ("keyframe", "path")
+    found = change_contact(ik, start, steps[0], OPTIONS)
+    assert found.status is list(Status)[1]
     assert tried[0] == start.stance
     toes = max(ik.kin.bearing_points("LFoot", np.array([0.0, 0.0, 1.0]))[:, 0])
     for c in tried[1]:
@@ -365,19 +352,11 @@ def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkey
         assert c.position[0] == pytest.approx(toes, abs=1e-6)
 
 
-def test_the_reason_is_that_of_flat_feet_where_tiptoe_does_not_help(
-    ik, steps, monkeypatch
-):
-    reasons = iter(["flat", "tiptoe"])
-    monkeypatch.setattr(change, "_plan_on", lambda *_: next(reasons))
-    start = standing(ik, OPTIONS)
-    assert plan_step(ik, start, steps[0], "direct", OPTIONS, quiet) == "flat"
-
-
 def test_a_box_higher_than_flat_feet_reach_is_climbed_on_tiptoe(coman, demo_sequence):
     found = plan(demo_sequence, coman, Scene.from_height(0.56))
     assert found.complete
     assert all(k.equilibrium.feasible for k in found.keyframes)
-    tiptoe = [c for p in found.paths for c in p.transition.held if c.edge is not None]
+    held = [c for change in found.changes for c in change.phases[1].contacts]
+    tiptoe = [c for c in held if c.edge is not None]
     assert {c.surface for c in tiptoe} <= {"LFoot", "RFoot"}
     assert {c.support for c in found.keyframes[-1].stance} == {"box"}

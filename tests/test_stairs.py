@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -282,8 +283,8 @@ def climbing():
     for _ in range(4):
         made, why = traverse._up_stairs(task, keys[-1], platform)
         assert not why
-        keys += [key for key, _, _ in made]
-        paths += [path for _, path, _ in made]
+        keys += [change.keyframe for change, _ in made]
+        paths += [change for change, _ in made]
     return task, platform, keys, paths
 
 
@@ -320,7 +321,7 @@ def test_a_limb_that_goes_up_does_not_graze_the_riser_of_its_tread(climbing):
             q = interpolate(task.ik.kin, a, b, 0.5)
             task.ik.kin.update(q)
             p = task.ik.kin.contact_point(
-                path.transition.step.makes.surface, np.array([0.0, 0.0, 1.0])
+                path.step.makes.surface, np.array([0.0, 0.0, 1.0])
             )
             away = min(np.linalg.norm(p - start), np.linalg.norm(p - end))
             if away > 0.25 * np.linalg.norm(end - start):
@@ -360,7 +361,7 @@ def test_a_pair_that_does_not_fit_goes_to_its_next_places(climbing, monkeypatch)
         asked.append((surface, float(place.position[0])))
         if surface == "RFoot" and place is far:
             return "too far"
-        return key, None
+        return SimpleNamespace(keyframe=key)
 
     monkeypatch.setattr(traverse, "next_contacts", wanted)
     monkeypatch.setattr(traverse, "_attempt", attempt)

@@ -37,7 +37,7 @@ from clamber.step.statics import (
 @pytest.fixture(scope="module")
 def knee_phases(demo_plan):
     """Shift, swing and settle of the left knee."""
-    path = next(p for p in demo_plan.paths if "LFoot" in p.transition.step.breaks)
+    path = next(p for p in demo_plan.changes if "LFoot" in p.step.breaks)
     return path.phases
 
 
@@ -139,7 +139,7 @@ def test_it_starts_and_ends_at_rest(demo_plan):
 def test_it_is_at_rest_wherever_contacts_change(demo_plan):
     trajectory = demo_plan.trajectory
     changes = 1 + np.flatnonzero(np.diff(trajectory.contact, axis=0).any(axis=1))
-    assert len(changes) >= 2 * len(demo_plan.paths) - 2
+    assert len(changes) >= 2 * len(demo_plan.changes) - 2
     for k in changes:
         assert not trajectory.v[k - 1].any()
         assert np.abs(trajectory.v[k]).max() < 1e-3
@@ -181,7 +181,7 @@ def test_it_passes_through_every_posture_of_every_path_in_order(
     demo_plan, demo_kinematics
 ):
     trajectory, k = demo_plan.trajectory, 0
-    for path in demo_plan.paths:
+    for path in demo_plan.changes:
         for phase in path.phases:
             for node in phase.q:
                 window = trajectory.q[k : k + 8000]
@@ -257,7 +257,7 @@ def test_feed_forward_balances_gravity_all_the_while_load_is_handed_over(
     demo_plan, demo_kinematics
 ):
     """Contacts that leave bear until the centre of mass is over those that stay."""
-    for path in demo_plan.paths:
+    for path in demo_plan.changes:
         for phase in path.phases:
             both = {
                 (c.surface, c.edge): c for c in (*phase.load_before, *phase.load_after)
@@ -425,7 +425,7 @@ def lowest_dynamic_margin(kin, world, phases, speed: float) -> float:
 def test_a_fast_motion_is_slowed_down_until_inertia_leaves_it_balanced(
     demo_plan, demo_kinematics, monkeypatch
 ):
-    first = demo_plan.paths[0].phases  # standing: nothing but the feet
+    first = demo_plan.changes[0].phases  # standing: nothing but the feet
     world = demo_plan.world
     margin = lowest_dynamic_margin(demo_kinematics, world, first, 2.0)
     assert margin > 0.0
@@ -435,7 +435,7 @@ def test_a_fast_motion_is_slowed_down_until_inertia_leaves_it_balanced(
 
 
 def test_a_slow_motion_goes_at_the_speed_that_was_asked_for(demo_plan):
-    swing = next(p for p in demo_plan.paths[0].phases if p.kind == "swing")
+    swing = next(p for p in demo_plan.changes[0].phases if p.kind == "swing")
     slow = build_trajectory(demo_plan.world, [swing], speed=0.1)
     fastest = np.abs(slow.v).max(axis=0)
     fastest[:3] /= BASE_LENGTH

@@ -29,8 +29,8 @@ AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def transitions(demo_plan):
-    return [p.transition for p in demo_plan.paths]
+def transitions(demo_paths):
+    return [p.transition for p in demo_paths]
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +177,7 @@ def test_transitions_lead_from_keyframe_to_keyframe(demo_plan, transitions):
 def test_a_worse_posture_is_named(demo_plan, ik):
     """A contact out of reach: the transition says so instead of pretending."""
     before, after = demo_plan.keyframes[1:3]
-    move = demo_plan.paths[1].transition.step
+    move = demo_plan.changes[1].step
     far = replace(move.makes, position=move.makes.position + 0.6 * AHEAD)
     states = tuple(
         replace(s, contact=far) if s.contact.surface == far.surface else s
@@ -225,7 +225,7 @@ def test_a_foot_on_an_edge_stays_on_it(ik, demo_plan):
 def test_joints_too_weak_for_a_shift_are_named(demo_plan, ik):
     """The same postures, but motors that cannot hold them."""
     before, after = demo_plan.keyframes[4:6]
-    move = demo_plan.paths[4].transition.step
+    move = demo_plan.changes[4].step
     weak = IK(replace(ik.world, tau_max=0.05 * ik.world.tau_max))
     strong, feeble = (
         plan_transition(x, before, after, move, margin=0.025) for x in (ik, weak)

@@ -84,7 +84,7 @@ def contact(surface: str, x: float, y: float, support="table") -> Contact:
 
 def assert_contacts_are_kept(plan: Plan) -> None:
     kin = Kinematics(plan.world)
-    for path in plan.paths:
+    for path in plan.changes:
         for phase in path.phases:
             for q in phase.q:
                 kin.update(q)
@@ -171,7 +171,8 @@ def test_where_there_is_no_way_down_contacts_move_to_where_there_is(task, monkey
             replace(c, position=place.position) if c.surface == surface else c
             for c in key.stance
         )
-        return SimpleNamespace(stance=moved, made=key.made + 1), "path"
+        after = SimpleNamespace(stance=moved, made=key.made + 1)
+        return SimpleNamespace(keyframe=after)
 
     monkeypatch.setattr(module, "_attempt", attempt)
     refused: list[str] = []
@@ -182,7 +183,7 @@ def test_where_there_is_no_way_down_contacts_move_to_where_there_is(task, monkey
         assert [x for _, x, *_ in seen] == pytest.approx([0.83, 0.84])
         assert [k for *_, k in seen] == [0, 1]
         assert len(made) == moved
-        assert made[-1][0].stance[0].position[0] == pytest.approx(0.8)
+        assert made[-1][0].keyframe.stance[0].position[0] == pytest.approx(0.8)
         assert {name for *_, name in made} == {"ac3"}
         refused.append("LKnee")
 
@@ -387,13 +388,13 @@ def test_contacts_that_come_back_to_where_they_were_end_the_plan(task, monkeypat
 
     def manoeuvre(task, key):
         other = keys["back" if key is keys["ahead"] else "ahead"]
-        return [(other, "path", "ac3")], ""
+        return [(SimpleNamespace(keyframe=other), "ac3")], ""
 
     monkeypatch.setattr(module, "_manoeuvre", manoeuvre)
     found = module._follow((task,), keys["back"], 100, lambda *a: None)
-    assert not found.arrived
-    assert "to and fro" in found.missed
-    assert len(found.paths) == 3  # ahead, back, and ahead again
+    assert not found.route.arrived
+    assert "to and fro" in str(found.route.failures[0])
+    assert len(found.route.changes) == 3  # ahead, back, and ahead again
     same = module._same
     a, b = keys["back"].stance, keys["ahead"].stance
     assert same(a, a[::-1])
@@ -453,7 +454,7 @@ def test_a_box_is_crossed_and_the_robot_stands_beyond_it(crossing):
 def test_every_posture_of_a_crossing_keeps_its_contacts(crossing):
     kin = Kinematics(crossing.world)
     for before, path, after in zip(
-        crossing.keyframes, crossing.paths, crossing.keyframes[1:], strict=False
+        crossing.keyframes, crossing.changes, crossing.keyframes[1:], strict=False
     ):
         np.testing.assert_array_equal(path.phases[0].q[0], before.q)
         np.testing.assert_array_equal(path.phases[-1].q[-1], after.q)
@@ -465,7 +466,7 @@ def test_every_posture_of_a_crossing_keeps_its_contacts(crossing):
 
 @pytest.mark.slow
 def test_cycles_follow_one_another_as_in_the_policy_and_the_cost_falls(crossing):
-    assert len(crossing.iterations) == len(crossing.paths)
+    assert len(crossing.iterations) == len(crossing.changes)
     names = [i.option for i in crossing.iterations]
     runs = [n for k, n in enumerate(names) if k == 0 or names[k - 1] != n]
     assert runs[:3] == ["ac1", "ac2", "ac3"]
@@ -482,10 +483,10 @@ def test_a_policy_goes_on_from_any_stance_on_the_way(crossing):
         if all(c.support == "table" for c in k.stance) and len(k.stance) == 4
     )
     found = follow_policy(IK(crossing.world), POLICY, middle, PlanOptions(), changes=4)
-    assert not found.missed
-    assert not found.arrived
-    assert len(found.paths) >= 4
-    assert found.keyframes[0] is middle
+    assert not found.route.failures
+    assert not found.route.arrived
+    assert len(found.route.changes) >= 4
+    assert found.route.start is middle
 
 
 @pytest.mark.slow
@@ -506,13 +507,14 @@ def test_cycles_without_getting_nearer_are_given_up(robot, monkeypatch):
         """Two centimetres farther away from the goal with every cycle."""
         away = np.array([-0.02, 0.0, 0.0])
         stance = tuple(replace(c, position=c.position + away) for c in key.stance)
-        return [(SimpleNamespace(stance=stance), None, "ac3")], ""
+        change = SimpleNamespace(keyframe=SimpleNamespace(stance=stance))
+        return [(change, "ac3")], ""
 
     monkeypatch.setattr(module, "_manoeuvre", back)
     found = follow_policy(ik, POLICY, key, PlanOptions(), changes=1000)
-    assert "no nearer to the goal" in found.missed
-    assert not found.arrived
-    assert len(found.paths) == module.PATIENCE + 1
+    assert "no nearer to the goal" in str(found.route.failures[0])
+    assert not found.route.arrived
+    assert len(found.route.changes) == module.PATIENCE + 1
 
 
 def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step(
@@ -532,10 +534,11 @@ def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step(
 
     def manoeuvre(task, key):
         asked.append(task.policy)
-        on = SimpleNamespace(stance=(contact("LKnee", 0.1 * len(asked), 0.0),))
+        stance = (contact("LKnee", 0.1 * len(asked), 0.0),)
+        on = SimpleNamespace(keyframe=SimpleNamespace(stance=stance))
         if task.policy is policy:
-            return ([(on, None, "ac3")], "") if len(asked) == 1 else ([], "stuck")
-        return ([(on, None, "ac1")], "") if len(asked) < 5 else ([], "stuck too")
+            return ([(on, "ac3")], "") if len(asked) == 1 else ([], "stuck")
+        return ([(on, "ac1")], "") if len(asked) < 5 else ([], "stuck too")
 
     monkeypatch.setattr(module, "_manoeuvre", manoeuvre)
     found = follow_policy(ik, policy, key, PlanOptions(), changes=9)
@@ -544,8 +547,8 @@ def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step(
     names = [i.option for i in found.iterations]
     assert names == ["ac3", "ac1, secondary 1"]
     assert found.instead == "secondary 1 from change 2 on (stuck)"
-    assert found.missed == "stuck"
-    assert not found.arrived
+    assert str(found.route.failures[0]) == "stuck"
+    assert not found.route.arrived
 
 
 @pytest.mark.slow
@@ -561,11 +564,11 @@ def test_a_limb_that_lost_its_contact_is_set_down_first(crossing, lost):
     task = KeyframeTask(held=held, new=(), q_reference=middle.q)
     key = direct.optimise(ik, task, middle.q, PlanOptions().keyframe)
     found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
-    assert not found.missed
-    move = found.paths[0].transition.step
+    assert not found.route.failures
+    move = found.route.changes[0].step
     assert move.makes.surface == lost
     assert move.breaks == ()
-    assert len(found.keyframes[-1].stance) == 4
+    assert len(found.route.end.stance) == 4
 
 
 @pytest.mark.slow
@@ -577,8 +580,8 @@ def test_a_foot_that_lost_the_ground_is_set_down(robot):
     task = KeyframeTask(held=left, new=(), q_reference=both.q)
     key = direct.optimise(ik, task, both.q, PlanOptions().keyframe)
     found = follow_policy(ik, POLICY, key, PlanOptions(), changes=2)
-    assert not found.missed
-    assert {c.surface for c in found.keyframes[-1].stance} == {"LFoot", "RFoot"}
+    assert not found.route.failures
+    assert {c.surface for c in found.route.end.stance} == {"LFoot", "RFoot"}
 
 
 def test_it_turns_only_where_walls_leave_it_room(robot):

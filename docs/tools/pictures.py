@@ -146,19 +146,18 @@ def stability() -> Figure:
 def transition(plan) -> Figure:
     """From above: the polygon of the contacts that stay, its ellipse, the CoM's way."""
     fig = Figure(figsize=(7, 3.0), layout="constrained")
-    chosen = (plan.paths[0], plan.paths[-2])
-    for ax, path in zip(fig.subplots(1, 2), chosen, strict=True):
-        t = path.transition
+    chosen = (plan.changes[0], plan.changes[-2])
+    for ax, change in zip(fig.subplots(1, 2), chosen, strict=True):
         kin = Kinematics(plan.world)
         com = []
-        for phase in path.phases:
+        for phase in change.phases:
             for q in phase.q:
                 kin.update(q)
                 com.append(kin.com[:2].copy())
-        kin.update(t.touching)
+        kin.update(change.touching)
         points = [
             p
-            for c in t.held
+            for c in change.phases[1].contacts
             for p in kin.bearing_points(
                 c.surface, plan.world.supports[c.support].normal, c.edge
             )
@@ -182,7 +181,7 @@ def transition(plan) -> Figure:
         ax.plot(*way.T, color=BLUE, lw=1.5)
         ax.plot(*way[0], "o", color="w", mec=BLUE, label="before")
         ax.plot(*way[-1], "o", color=BLUE, label="after")
-        ax.set(aspect="equal", title=str(t.step), xlabel="to the right [m]")
+        ax.set(aspect="equal", title=str(change.step), xlabel="to the right [m]")
         ax.set_ylabel("ahead [m]")
         finish_axes(ax)
         ax.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1, 0.9))
@@ -206,17 +205,16 @@ def paths(plan) -> Figure:
             color=GREY,
         )
     up = np.array([0.0, 0.0, 1.0])
-    for path, colour in ((plan.paths[0], BLUE), (plan.paths[-2], RED)):
-        (swing,) = [p for p in path.phases if p.kind == "swing"]
-        move = path.transition.step
+    for change, colour in ((plan.changes[0], BLUE), (plan.changes[-2], RED)):
+        swing, surface = change.phases[1], change.step.makes.surface
         kin, way = Kinematics(plan.world), []
-        surface = move.makes.surface
         for q in swing.q:
             kin.update(q)
             way.append(kin.contact_point(surface, up).copy())
         way = np.array(way)
         ax.plot(swing.arc[:, 0], swing.arc[:, 2], "--", color=colour, lw=1)
-        ax.plot(way[:, 0], way[:, 2], "o-", color=colour, ms=3, lw=1.2, label=str(move))
+        label = str(change.step)
+        ax.plot(way[:, 0], way[:, 2], "o-", color=colour, ms=3, lw=1.2, label=label)
     ax.axhline(0, color="k", lw=0.8)
     ax.set(aspect="equal", xlabel="x [m]", ylabel="z [m]", xlim=(-0.15, 0.93))
     finish_axes(ax)

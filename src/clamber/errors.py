@@ -73,6 +73,7 @@ class Status(enum.Enum):
     COLLIDING = "links collide or come closer than the safety distance"
     SLIDING = "a new contact cannot support its mass within the friction cone"
     OVERLOADED = "no contact forces within the friction cones and torque limits hold it"
+    STUCK = "no contact change brings the robot nearer to its goal"
 
 
 def read_yaml(path: Path) -> dict:

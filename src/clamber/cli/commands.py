@@ -380,7 +380,7 @@ class ReplanCommand:
                 ", ".join(r.surfaces) or "as demonstrated",
                 "yes" if r.stable else "no",
                 f"{r.cost:.3f}",
-                str(len(r.plan.paths)),
+                str(len(r.plan.changes)),
                 "" if r.stable else outcome(r.plan),
             )
         stable = found.best.stable
@@ -400,15 +400,15 @@ class ReplanCommand:
         q, touching = load_state(made, self.source, begin)
         with self.output.progress() as report, self.world.blamed():
             report("replan", 0.0, "")
-            now = clamber.midway_of(made, scene, q, touching, source=begin)
+            now = clamber.state_of(made, scene, q, touching, source=begin)
             plan = clamber.replan_rest(made, now, scene, **others, progress=report)
             folder = clamber.new_run_folder(self.out, "replan")
             clamber.save_sequence(plan.sequence, folder / "sequence.json")
             clamber.save_plan(plan, folder)
-        record = {"out": str(folder), "made": now.made, **plan_record(plan)}
-        on = ", ".join(f"{c.surface} on {c.support}" for c in now.contacts)
-        note = f"from {on}, {now.made} steps made: {outcome(plan)}"
-        tables = keyframe_tables(record) if plan.keyframes else []
+        record = {"out": str(folder), "done": now.done, **plan_record(plan)}
+        on = ", ".join(f"{c.surface} on {c.support}" for c in now.stance)
+        note = f"from {on}, {now.done} steps made: {outcome(plan)}"
+        tables = keyframe_tables(record)
         self.output.show(
             record,
             *tables,

@@ -12,7 +12,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -174,16 +174,15 @@ def new_table(*columns: str, numbers: bool = False) -> Table:
 
 def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any]:
     """What `--json` says of a plan; costs and margins are those of `plan.json`."""
-    moves = [None, *(p.transition.step for p in plan.paths)]
+    moves = [None, *(c.step for c in plan.changes)]
     keyframes = []
-    for i, key in enumerate(plan.keyframes):
-        move = moves[i] if i < len(moves) else None
+    for move, key in zip(moves, plan.keyframes, strict=True):
         keyframes.append(
             {
-                "move": "start" if i == 0 else str(move),
+                "move": "start" if move is None else str(move),
                 "method": key.method,
                 "iterations": key.iterations,
-                "seconds": None if clock is None or i == 0 else clock.of(move),
+                "seconds": None if clock is None or move is None else clock.of(move),
                 "cost_before": key.cost_before,
                 "cost_after": key.cost_after,
                 "projected_distance": {
@@ -196,9 +195,10 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
         )
     return {
         "complete": plan.complete,
-        "instead": plan.instead,
+        "fallback": None if plan.fallback is None else str(plan.fallback),
         "keyframes": keyframes,
-        "skipped": [{"stance": s.stance, "reason": s.reason} for s in plan.skipped],
+        "skipped": [asdict(s) for s in plan.skipped],
+        "failures": [str(f) for f in plan.failures],
     }
 
 
@@ -243,12 +243,12 @@ def replanned_record(found: clamber.Replanned) -> dict[str, Any]:
 def outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
-        return "; ".join(filter(None, (plan.instead, "planned to the last stance")))
-    if plan.instead:
-        return f"the robot cannot do it: {plan.instead}"
-    missed = [s.reason for s in plan.skipped if s.missed]
-    why = (missed or [s.reason for s in plan.skipped] or ["there is no move in it"])[0]
-    return f"the robot cannot do it: {why}"
+        return _after_fallback(plan, "planned to the last stance")
+    return f"the robot cannot do it: {plan.fallback or plan.why_not}"
+
+
+def _after_fallback(plan: clamber.Plan, note: str) -> str:
+    return note if plan.fallback is None else f"{plan.fallback}; {note}"
 
 
 def closing(note: str, folder: Path, well: bool) -> str:
@@ -258,13 +258,14 @@ def closing(note: str, folder: Path, well: bool) -> str:
 
 
 def skipped_tables(plan: clamber.Plan) -> list[Table]:
-    """A table of the stances left out, where there are any."""
-    if not plan.skipped:
-        return []
+    """A table of the stances left out, and of what there is no way for."""
+    rows = [(str(s.stance), s.reason) for s in plan.skipped]
+    for f in plan.failures:
+        rows.append(("" if f.step is None else str(f.step.stance), str(f)))
     table = new_table("skipped stance", "because")
-    for s in plan.skipped:
-        table.add_row(str(s.stance), s.reason)
-    return [table]
+    for row in rows:
+        table.add_row(*row)
+    return [table] if rows else []
 
 
 def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
@@ -321,7 +322,7 @@ def conclude(
         **planned,
     }
     if reached:
-        note = "; ".join(filter(None, (plan.instead, "the robot made it")))
+        note = _after_fallback(plan, "the robot made it")
     elif not plan.complete:
         note = outcome(plan)
     elif rollout is not None and rollout.stopped:

@@ -44,6 +44,7 @@ class Step:
         stands_up: To the posture that the robot starts in, which goes before these: it
             is the last step, and ends on the feet. A person who has just got up is
             bent, and so is a robot that held on till then.
+        index: Which step of its sequence it is; None: it is of none.
     """
 
     limb: str
@@ -56,6 +57,7 @@ class Step:
     base_rotation: np.ndarray | None = None
     reference: np.ndarray | None = None
     stands_up: bool = False
+    index: int | None = None
 
     def __str__(self) -> str:
         """Such as `LHand -> LElbow on box`."""
@@ -65,17 +67,15 @@ class Step:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Skipped:
-    """A stance of the demonstration that is no keyframe, and why.
+    """A stance of the demonstration that takes no step, and why.
 
     Attributes:
         stance: Its index in the sequence.
         reason: For people.
-        missed: A way was looked for and not found; otherwise there was nothing to do.
     """
 
     stance: int
     reason: str
-    missed: bool = False
 
 
 def split_moves(
@@ -132,6 +132,7 @@ def split_moves(
                     fixed=makes is not None and makes.fixed,
                     target=stance,
                     stance=i,
+                    index=len(steps),
                 )
             )
         if len(steps) == before:

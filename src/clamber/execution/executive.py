@@ -54,14 +54,13 @@ from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, chain_up, limb_links
 from clamber.planning.adaptation import (
     REACH,
-    Adapted,
     adapt_plan,
     feeling,
     felt_contact,
     go_on,
     start_again,
 )
-from clamber.planning.records import Midway, Plan
+from clamber.planning.records import Plan, State
 from clamber.planning.trajectory import HOLD_END, HOLD_START, Trajectory
 from clamber.step.posture import Keyframe
 
@@ -159,7 +158,7 @@ class Execution:
         ]
         self._ankles = _ankles(world)
         self._positioned = np.zeros(len(self._qadr))  # share of (4.32), by joint
-        self._made = 0 if plan.midway is None else plan.midway.made
+        self._made = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance.
         by_policy = plan.policy is not None
         self._steps = () if by_policy else split_moves(plan.sequence, plan.world)[0]
@@ -185,7 +184,8 @@ class Execution:
         self.events: list[Event] = []
         self.stopped = ""
         self.rests_on: tuple[str, ...] = ()
-        self._adopt(plan.world, plan.trajectory, plan.keyframes, "", more=False)
+        # As far as it goes it is followed, whatever it misses.
+        self._adopt(replace(plan, complete=True, failures=()), plan.trajectory)
         self._set(plan.trajectory, 0)
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
         self._behaviour = self._behave()
@@ -311,16 +311,10 @@ class Execution:
         found = go_on(self._plan, self._world, key, self._wary)
         if found.trajectory is None:
             self._more = False
-            if found.missed:
-                self._stop(found.missed)
+            if found.failures:
+                self._stop(str(found.failures[0]))
             return
-        self._adopt(
-            found.world,
-            found.trajectory,
-            found.keyframes,
-            found.missed,
-            more=found.more,
-        )
+        self._adopt(found, found.trajectory)
         yield from self._play(round(HOLD_START / PHYSICS_STEP) - 1)
 
     def _take(self, made: Contact) -> Ticks:
@@ -355,7 +349,7 @@ class Execution:
         if abs(ratio - 1.0) > MASS_CHANGE:
             self._note(Heavier, factor=ratio)
             self._scale = float(np.clip(ratio, 0.5, 2.0))
-        if self._plan.midway is not None:
+        if self._plan.state is not None:
             yield from self._check_stance()
             return
         q, ref = self._pose, self.reference
@@ -503,9 +497,9 @@ class Execution:
         bearing = [c in loaded for c in contacts]
         felt = [self._as_felt(c) for c in contacts]
         self._remember(felt)
-        now = Midway(
-            made=self._made,
-            contacts=tuple(felt),
+        now = State(
+            done=self._made,
+            stance=tuple(felt),
             loaded=tuple(c for c, b in zip(felt, bearing, strict=True) if b),
             q=self._rebased(),
         )
@@ -515,26 +509,21 @@ class Execution:
         yield from self._rest(THINKING)
         yield from self._follow(found, off)
 
-    def _follow(self, found: Adapted, off: float) -> Ticks:
+    def _follow(self, found: Plan, off: float) -> Ticks:
         """Go by another plan; or, where that is worse, by the one at hand."""
-        no_better = bool(found.missed) and off < FALLBACK and not self._missed
+        missed = str(found.failures[0]) if found.failures else ""
+        no_better = bool(missed) and off < FALLBACK and not self._missed
         if found.trajectory is None or no_better:
-            yield from self._go_on(off, found.missed)
+            yield from self._go_on(off, missed)
             return
-        steps = len(found.keyframes) - 1
-        if found.missed and steps == 0:
-            self._stop(found.missed)
+        steps = len(found.changes)
+        if missed and steps == 0:
+            self._stop(missed)
             return
         self._note(Replanned, changes=steps)
-        self._adopt(
-            found.world,
-            found.trajectory,
-            found.keyframes,
-            found.missed,
-            more=found.more,
-        )
+        self._adopt(found, found.trajectory)
         self._i = round(HOLD_START / PHYSICS_STEP) - 1
-        if steps == 0 and not found.more:  # there is still the way to the last posture
+        if steps == 0 and not self._more:  # there is still the way to the last posture
             yield from self._play(_arrival(found.trajectory))
 
     def _go_on(self, off: float, why: str) -> Ticks:
@@ -557,20 +546,13 @@ class Execution:
 
     # What it knows.
 
-    def _adopt(
-        self,
-        world: World,
-        trajectory: Trajectory,
-        keyframes: Sequence[Keyframe],
-        missed: str,
-        *,
-        more: bool,
-    ) -> None:
-        self._world, self._kin = world, Kinematics(world)
+    def _adopt(self, plan: Plan, trajectory: Trajectory) -> None:
+        self._world, self._kin = plan.world, Kinematics(plan.world)
         self._trajectory, self._i = trajectory, 0
-        self._keyframes = list(keyframes)
-        self._legs, self._leg = _legs(trajectory, keyframes), 0
-        self._missed, self._more = missed, more
+        self._keyframes = list(plan.keyframes)
+        self._legs, self._leg = _legs(trajectory, plan.keyframes), 0
+        self._missed = str(plan.failures[0]) if plan.failures else ""
+        self._more = not plan.complete and not plan.failures  # a policy goes on
         self._return: tuple[np.ndarray, np.ndarray, int] | None = None
 
     @property

@@ -151,7 +151,7 @@ def simulate(
     if plan.trajectory is None:
         raise ValueError("the plan has no trajectory")
     d = disturbance or Disturbance()
-    if plan.midway is not None and (d.x, d.y, d.yaw) != (0.0, 0.0, 0.0):
+    if plan.state is not None and (d.x, d.y, d.yaw) != (0.0, 0.0, 0.0):
         raise InputError(
             "0: the plan begins in the middle of a climb, not at the scene's start",
             field="disturb.x, y, yaw",
@@ -163,7 +163,7 @@ def simulate(
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
     push = push_of(d, float(plan.trajectory.time[-1]))
     report = progress or (lambda stage, share, note: None)
-    start = world.home if plan.midway is None else plan.midway.q
+    start = world.home if plan.state is None else plan.state.q
     planned = len(plan.trajectory.time)
     return _run(world, start, follows, sensors, push, planned, report)
 

@@ -9,7 +9,7 @@ was planned is a trajectory of its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World, build_world, limb_links
 from clamber.planning.gait import follow_policy
 from clamber.planning.planner import search_steps, timed
-from clamber.planning.records import Midway, Plan, PlanOptions
+from clamber.planning.records import Plan, PlanOptions, State
 from clamber.planning.trajectory import (
     HOLD_END,
     HOLD_START,
@@ -32,9 +32,9 @@ from clamber.planning.trajectory import (
     build_trajectory,
 )
 from clamber.step import direct
-from clamber.step.change import standing
+from clamber.step.change import Failure, standing
 from clamber.step.ik import IK, NO_WARINESS, ContactGoal, Wary, support_rotation
-from clamber.step.path import ARC_WEIGHT, Path, Phase, bridge
+from clamber.step.path import ARC_WEIGHT, Phase, bridge
 from clamber.step.posture import Keyframe, KeyframeTask
 from clamber.step.stability import contact_points
 from clamber.step.statics import com_margin, support_polygon
@@ -46,27 +46,6 @@ FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, with
 FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Adapted:
-    """The rest of a plan.
-
-    Attributes:
-        world: As it is believed to be.
-        trajectory: None where there is no way, or nothing left to do.
-        keyframes: The present stance first; one more for each step.
-        paths: Between them.
-        missed: Why steps are missing; empty where none is.
-        more: A policy goes on from the last keyframe.
-    """
-
-    world: World
-    trajectory: Trajectory | None
-    keyframes: tuple[Keyframe, ...]
-    paths: tuple[Path, ...] = ()
-    missed: str
-    more: bool = False
 
 
 def felt_contact(kin: Kinematics, c: Contact) -> Contact:
@@ -90,10 +69,10 @@ def felt_contact(kin: Kinematics, c: Contact) -> Contact:
 def adapt_plan(
     plan: Plan,
     scene: Scene,
-    now: Midway,
+    now: State,
     commanded: np.ndarray,
     wary: Wary = NO_WARINESS,
-) -> Adapted:
+) -> Plan:
     """Take a stance as it is and plan the steps that are left.
 
     Args:
@@ -103,39 +82,38 @@ def adapt_plan(
         now: Where the robot is.
         commanded: (nq,) reference at present; the new one begins there.
         wary: How much farther parts stay from supports, see `IK`; likewise.
+
+    Returns:
+        Where it ends before the last step without a failure, a policy goes on.
     """
     found = _adapt(plan, scene, now, commanded, wary)
-    if found.missed and (wary or any(b.roughness > 0 for b in scene.boxes)):
+    if found.failures and (wary or any(b.roughness > 0 for b in scene.boxes)):
         smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
         other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NO_WARINESS)
         return _farther(found, other)
     return found
 
 
-def _farther(found: Adapted, other: Adapted) -> Adapted:
+def _farther(found: Plan, other: Plan) -> Plan:
     """The other one where it gets farther, and the first misses something."""
-    more = not other.missed or len(other.keyframes) > len(found.keyframes)
+    more = not other.failures or len(other.changes) > len(found.changes)
     return other if more else found
 
 
 def _adapt(
-    plan: Plan,
-    scene: Scene,
-    now: Midway,
-    commanded: np.ndarray,
-    wary: Wary,
-) -> Adapted:
+    plan: Plan, scene: Scene, now: State, commanded: np.ndarray, wary: Wary
+) -> Plan:
     ik = IK(build_world(plan.world.robot, scene), wary)
-    settled = settle(ik, now, commanded, plan.options)
-    if isinstance(settled, str):
-        return Adapted(world=ik.world, trajectory=None, keyframes=(), missed=settled)
-    return _rest(plan, ik, now.made, *settled)
+    key, lead = settle(ik, now, commanded, plan.options)
+    return _rest(plan, ik, key, now, lead)
 
 
 def settle(
-    ik: IK, now: Midway, commanded: np.ndarray, options: PlanOptions
-) -> tuple[Keyframe, tuple[Phase, ...]] | str:
-    """The optimised posture of a stance as it is and the way there, or why not.
+    ik: IK, now: State, commanded: np.ndarray, options: PlanOptions
+) -> tuple[Keyframe, tuple[Phase, ...]]:
+    """The optimised posture of a stance as it is, and the way there.
+
+    Where there is no such posture, its status says so, and there is no way.
 
     Args:
         ik: Workspace, of the world as it is believed to be.
@@ -147,45 +125,45 @@ def settle(
     problem = balance_problem(
         world,
         held=now.loaded,
-        closed=tuple(c for c in now.contacts if c not in now.loaded),
+        closed=tuple(c for c in now.stance if c not in now.loaded),
         q_reference=now.q,
         posture_weight=1.0,
         margin=0.005,
     )
     problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
     here = ik.solve_hard(problem, now.q)
-    task = KeyframeTask(held=now.contacts, new=(), q_reference=here.q)
+    task = KeyframeTask(held=now.stance, new=(), q_reference=here.q)
     key = direct.optimise(ik, task, here.q, options.keyframe)
     if key.status is not Status.SOLVED:
-        return f"no stable posture here: {key.status.value}"
+        return key, ()
     begin = here.q.copy()
     begin[world.qadr] = commanded[world.qadr]
     lead = (
         Phase(
             kind="shift",
             q=np.array([begin, here.q]),
-            contacts=now.contacts,
+            contacts=now.stance,
             load_before=now.loaded,
             load_after=now.loaded,
         ),
         Phase(
             kind="settle",
-            q=bridge(ik, here.q, key.q, now.contacts, now.contacts),
-            contacts=now.contacts,
+            q=bridge(ik, here.q, key.q, now.stance, now.stance),
+            contacts=now.stance,
             load_before=now.loaded,
-            load_after=now.contacts,
+            load_after=now.stance,
         ),
     )
     return key, lead
 
 
-def start_again(plan: Plan, scene: Scene) -> Adapted:
+def start_again(plan: Plan, scene: Scene) -> Plan:
     """The whole plan anew, from where the scene says that the robot stands."""
     ik = IK(build_world(plan.world.robot, scene))
-    return _rest(plan, ik, 0, standing(ik, plan.options.keyframe), ())
+    return _rest(plan, ik, standing(ik, plan.options.keyframe))
 
 
-def go_on(plan: Plan, world: World, key: Keyframe, wary: Wary = NO_WARINESS) -> Adapted:
+def go_on(plan: Plan, world: World, key: Keyframe, wary: Wary = NO_WARINESS) -> Plan:
     """A policy followed on from the last keyframe of what was planned ahead.
 
     Args:
@@ -194,53 +172,79 @@ def go_on(plan: Plan, world: World, key: Keyframe, wary: Wary = NO_WARINESS) -> 
         key: The last keyframe.
         wary: As in `adapt_plan`.
     """
-    found = _rest(plan, IK(world, wary), 0, key, ())
-    if found.missed and wary:
-        return _farther(found, _rest(plan, IK(world), 0, key, ()))
+    found = _rest(plan, IK(world, wary), key)
+    if found.failures and wary:
+        return _farther(found, _rest(plan, IK(world), key))
     return found
 
 
 def _rest(
-    plan: Plan, ik: IK, made: int, key: Keyframe, lead: tuple[Phase, ...]
-) -> Adapted:
-    """The steps after the first `made`, from a keyframe that `lead` leads to.
+    plan: Plan,
+    ik: IK,
+    key: Keyframe,
+    now: State | None = None,
+    lead: tuple[Phase, ...] = (),
+) -> Plan:
+    """What is left of a plan, from a keyframe that `lead` leads to.
 
-    A policy needs no count: it is followed from the stance, some steps ahead.
+    A policy needs no count of steps: it is followed from the stance, some ahead.
     """
-    world, more = ik.world, False
-    if plan.policy is not None:
-        found = follow_policy(ik, plan.policy, key, plan.options, HORIZON)
-        missed, more = found.missed, not (found.arrived or found.missed)
-    else:
+    world, sequence, iterations = ik.world, plan.sequence, ()
+    failure = None
+    if key.status is not Status.SOLVED and now is not None:
+        why = f"no stable posture here: {key.status.value}"
+        failure = Failure(status=key.status, detail=why)
+    elif plan.policy is None:
         try:
             sequence = retarget(plan.sequence, world)
         except InputError as e:
-            missed = str(e)
-            return Adapted(
-                world=world, trajectory=None, keyframes=(key,), missed=missed
-            )
-        steps = from_here(split_moves(sequence, world)[0][made:], key.stance, world)
-        found, _ = search_steps(ik, steps, plan.options, start=key)
-        missed = found.missed[0].reason if found.missed else ""
-    return Adapted(
+            failure = Failure(status=Status.UNREACHABLE, detail=str(e))
+    if failure is not None:
+        return Plan(
+            world=world,
+            options=plan.options,
+            sequence=sequence,
+            start=key,
+            failures=(failure,),
+            trajectory=None,
+            complete=False,
+            state=now,
+            policy=plan.policy,
+        )
+    if plan.policy is not None:
+        followed = follow_policy(ik, plan.policy, key, plan.options, HORIZON)
+        found, iterations = followed.route, followed.iterations
+    else:
+        done = 0 if now is None else now.done
+        steps = from_here(split_moves(sequence, world)[0][done:], key.stance, world)
+        found, _ = search_steps(ik, key, steps, plan.options)
+    return Plan(
         world=world,
-        trajectory=timed(world, found.paths, plan.options.speed, lead),
-        keyframes=found.keyframes,
-        paths=found.paths,
-        missed=missed,
-        more=more,
+        options=plan.options,
+        sequence=sequence,
+        start=key,
+        changes=found.changes,
+        failures=found.failures,
+        trajectory=timed(world, found.changes, plan.options.speed, lead),
+        complete=found.arrived,
+        state=now,
+        policy=plan.policy,
+        iterations=iterations,
     )
 
 
-def from_here(steps: list[Step], stance: Sequence[Contact], world: World) -> list[Step]:
-    """The steps, where each limb leaves the surface that it is really on."""
-    on = {world.robot.limb_of(c.surface).name: c.surface for c in stance}
+def from_here(
+    steps: Sequence[Step], stance: Sequence[Contact], world: World
+) -> list[Step]:
+    """The steps, where each limb leaves what it is really on.
+
+    That may be a surface that the steps do without.
+    """
+    on = {world.robot.limb_of(c.surface).name: (c.surface,) for c in stance}
     out = []
     for step in steps:
-        surface = on.pop(step.limb, None)
-        if surface is not None and step.breaks:
-            step = replace(step, breaks=(surface,))
-        out.append(step)
+        breaks = on.pop(step.limb, step.breaks)
+        out.append(replace(step, breaks=breaks))
     return out
 
 

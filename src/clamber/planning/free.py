@@ -34,10 +34,9 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
-from clamber.planning.records import PlanOptions, Progress
-from clamber.step.change import plan_step, standing
+from clamber.planning.records import PlanOptions, Progress, Route
+from clamber.step.change import Failure, change_contact
 from clamber.step.ik import IK
-from clamber.step.path import Path
 from clamber.step.posture import Keyframe
 from clamber.step.stability import STANDING_SHARE, standing_share
 
@@ -93,17 +92,14 @@ class Explored:
     """What a search for contacts found.
 
     Attributes:
-        keyframes: The start first; one more for each path. Where nothing was found,
-            those that it went on from.
-        paths: Between them.
+        route: What it found; where that is nothing, what it went on from.
         sequence: Of the stances found, a robot's own; None where nothing was found.
         states: That were expanded.
         tries: Steps that were planned.
         stop: Why it ended.
     """
 
-    keyframes: tuple[Keyframe, ...]
-    paths: tuple[Path, ...]
+    route: Route
     sequence: ContactSequence | None
     states: int
     tries: int
@@ -137,22 +133,6 @@ def action_counts(sequence: ContactSequence, world: World) -> Counts:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Reached:
-    """A stance that is reached, and how.
-
-    Attributes:
-        keyframes: The start first; one more for each path.
-        paths: Between them; steps: that they make.
-        cost: Of the actions.
-    """
-
-    keyframes: tuple[Keyframe, ...]
-    paths: tuple[Path, ...] = ()
-    steps: tuple[Step, ...] = ()
-    cost: float = 0.0
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Action:
     step: Step
     price: float
@@ -162,7 +142,8 @@ class _Action:
 class _Entry:
     priority: float
     order: int
-    state: Reached = field(compare=False)
+    route: Route = field(compare=False)
+    cost: float = field(compare=False)
     action: _Action = field(compare=False)
 
 
@@ -172,8 +153,8 @@ def explore(
     options: PlanOptions,
     counts: Counts,
     bounds: Bounds,
+    start: Route,
     *,
-    start: Reached | None = None,
     report: Progress = lambda stage, share, note: None,
 ) -> Explored:
     """Search for contacts that lead to where a sequence ends.
@@ -186,92 +167,70 @@ def explore(
         options: How steps are planned.
         counts: How often a demonstration takes an action.
         bounds: How far to go.
-        start: What to go on from; None: both feet where the robot starts.
+        start: What to go on from.
         report: Called with stage, share and note, for progress.
     """
     guide = _Guidance(ik.world, sequence, counts)
-    first = start or Reached(keyframes=(standing(ik, options.keyframe),))
     queue: list[_Entry] = []
     order = itertools.count()
     seen: set[frozenset] = set()
     often: Counter[frozenset] = Counter()  # like steps that were planned
     states = tries = 0
 
-    def expand(state: Reached) -> None:
-        for a in guide.actions(ik.kin, state):
-            push(state, a)
+    def expand(route: Route, cost: float) -> None:
+        for a in guide.actions(ik.kin, route.end):
+            push(route, cost, a)
 
-    def priority(state: Reached, a: _Action) -> float:
-        after = _after(state.keyframes[-1].stance, a.step)
+    def priority(route: Route, cost: float, a: _Action) -> float:
+        after = _after(route.end.stance, a.step)
         again = AGAIN * often[_kind(after)]
-        return state.cost + a.price + EAGER * guide.left(after) + again
+        return cost + a.price + EAGER * guide.left(after) + again
 
-    def push(state: Reached, a: _Action) -> None:
-        entry = _Entry(priority(state, a), next(order), state, a)
-        heapq.heappush(queue, entry)
+    def push(route: Route, cost: float, a: _Action) -> None:
+        rank = priority(route, cost, a)
+        heapq.heappush(queue, _Entry(rank, next(order), route, cost, a))
 
-    def ended(found: Reached | None, stop: Stop) -> Explored:
-        state = found or first
+    def ended(found: Route | None, stop: Stop) -> Explored:
         return Explored(
-            keyframes=state.keyframes,
-            paths=state.paths,
+            route=start if found is None else found,
             sequence=None if found is None else _as_sequence(ik.world, found),
             states=states,
             tries=tries,
             stop=stop,
         )
 
-    if guide.arrived(first.keyframes[-1]):
-        return ended(first, Stop.FOUND)
+    if guide.arrived(start.end):
+        return ended(replace(start, arrived=True), Stop.FOUND)
     if bounds.depth > 0:
         states = 1
-        expand(first)
+        expand(start, 0.0)
     while queue:
         if tries >= bounds.tries:
             return ended(None, Stop.TRIES)
         entry = heapq.heappop(queue)
-        state, action = entry.state, entry.action
-        after = _after(state.keyframes[-1].stance, action.step)
+        route, action = entry.route, entry.action
+        after = _after(route.end.stance, action.step)
         if _key(after) in seen:  # reached meanwhile, at less cost
             continue
-        if priority(state, action) > entry.priority:
-            push(state, action)  # it is less promising than it was
+        if priority(route, entry.cost, action) > entry.priority:
+            push(route, entry.cost, action)  # it is less promising than it was
             continue
         tries += 1
         often[_kind(after)] += 1
         report("explore", tries / bounds.tries, str(action.step))
-        reached = _take(ik, state, action, options)
-        if reached is None:
+        found = change_contact(
+            ik, route.end, action.step, options.keyframe, options.method
+        )
+        if isinstance(found, Failure):
             continue
-        seen |= {_key(after), _key(reached.keyframes[-1].stance)}
-        if guide.arrived(reached.keyframes[-1]):
-            return ended(reached, Stop.FOUND)
-        if len(reached.steps) - len(first.steps) < bounds.depth:
+        seen |= {_key(after), _key(found.keyframe.stance)}
+        route = replace(route, changes=(*route.changes, found))
+        if guide.arrived(route.end):
+            return ended(replace(route, arrived=True), Stop.FOUND)
+        if len(route.changes) - len(start.changes) < bounds.depth:
             states += 1
-            expand(reached)
+            expand(route, entry.cost + action.price)
     return ended(None, Stop.EXHAUSTED)
-
-
-def _take(
-    ik: IK, state: Reached, action: _Action, options: PlanOptions
-) -> Reached | None:
-    """The state that an action leads to; None where the step cannot be planned."""
-    result = plan_step(
-        ik,
-        state.keyframes[-1],
-        action.step,
-        options.method,
-        options.keyframe,
-        lambda stage: None,
-    )
-    if isinstance(result, str):
-        return None
-    return Reached(
-        keyframes=(*state.keyframes, result[0]),
-        paths=(*state.paths, result[1]),
-        steps=(*state.steps, action.step),
-        cost=state.cost + action.price,
-    )
 
 
 def _after(stance: Sequence[Contact], step: Step) -> tuple[Contact, ...]:
@@ -293,22 +252,17 @@ def _kind(stance: Sequence[Contact]) -> frozenset:
     return frozenset((c.surface, c.support) for c in stance)
 
 
-def _as_sequence(world: World, state: Reached) -> ContactSequence:
-    """The stances that a state has come through, one a second.
+def _as_sequence(world: World, route: Route) -> ContactSequence:
+    """The stances that a route comes through, one a second.
 
     A contact is where it was made: a foot that goes on tiptoe later has not moved.
     """
-    contacts = list(state.keyframes[0].stance)
-    stances = [Stance(contacts=tuple(contacts))]
-    for key, step in zip(state.keyframes[1:], state.steps, strict=True):
-        fresh = {c.surface: c for c in key.stance}
-        contacts = [
-            c
-            if step.makes is None or c.surface != step.makes.surface
-            else fresh[c.surface]
-            for c in _after(contacts, step)
-        ]
-        stances.append(Stance(contacts=tuple(contacts), posture=step.target.posture))
+    contacts = route.start.stance
+    stances = [Stance(contacts=contacts)]
+    for change in route.changes:
+        contacts = _after(contacts, change.step)
+        posture = change.step.target.posture
+        stances.append(Stance(contacts=contacts, posture=posture))
     return ContactSequence(
         source="search",
         subject=None,
@@ -398,9 +352,9 @@ class _Guidance:
         """Whether its surface may be the one that a limb ends on."""
         return not self._stands or on_feet(self._world, [c])
 
-    def actions(self, kin: Kinematics, state: Reached) -> list[_Action]:
-        """All that may be done in a state."""
-        key, world = state.keyframes[-1], self._world
+    def actions(self, kin: Kinematics, key: Keyframe) -> list[_Action]:
+        """All that may be done from a keyframe."""
+        world = self._world
         region = region_of(key.stance)
         kin.update(key.q)
         out = []

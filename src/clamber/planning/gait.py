@@ -28,15 +28,23 @@ from clamber.contact.policy import (
     pelvis_distribution,
     pelvis_rotation,
 )
-from clamber.contact.steps import Seeds, Skipped, Step
-from clamber.errors import InputError
+from clamber.contact.steps import Seeds, Step
+from clamber.errors import InputError, Status
 from clamber.model.robot import Robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import matrix_from_quat, quat_from_matrix, turn_about_z
 from clamber.model.world import World, build_world
 from clamber.planning.planner import check_start, search_steps, timed
 from clamber.planning.proportions import DEPTH, STAND, Build, build_of
-from clamber.planning.records import Iteration, Plan, PlanOptions, Progress
+from clamber.planning.records import (
+    Fallback,
+    Iteration,
+    Plan,
+    PlanOptions,
+    Progress,
+    Route,
+    numbered,
+)
 from clamber.planning.route import (
     Place,
     Platform,
@@ -46,9 +54,8 @@ from clamber.planning.route import (
     room_on,
 )
 from clamber.planning.stairs import CLEAR, FLUSH, is_flight, next_contacts
-from clamber.step.change import home_at, plan_step, standing
+from clamber.step.change import Change, Failure, change_contact, home_at, standing
 from clamber.step.ik import IK, PostureProblem, base_clearance, contact_clearance
-from clamber.step.path import Path
 from clamber.step.posture import CLEARANCE, Keyframe, held_goal
 
 TURN = 0.25  # [rad] of the body in one cycle on all fours
@@ -77,19 +84,13 @@ class Followed:
     """What following a policy gave.
 
     Attributes:
-        keyframes: The first one, and one more for each path.
-        paths: Between neighbouring keyframes.
-        iterations: One for each path.
-        missed: Why it did not get to the goal; empty where it did, or was cut short.
-        arrived: It is at the goal.
+        route: As far as it goes; neither arrived nor failed where it was cut short.
+        iterations: One for each change.
         instead: Where a secondary policy was followed, and why; empty: nowhere.
     """
 
-    keyframes: tuple[Keyframe, ...]
-    paths: tuple[Path, ...]
+    route: Route
     iterations: tuple[Iteration, ...]
-    missed: str
-    arrived: bool
     instead: str
 
 
@@ -121,7 +122,7 @@ class _Task:
     fours: np.ndarray
 
 
-_Made = tuple[Keyframe, Path, str]
+_Made = tuple[Change, str]
 
 
 def plan_traverse(
@@ -148,12 +149,13 @@ def plan_traverse(
     _check_route(tasks[0])
     found = _follow(tasks, start, options.max_changes, report)
     report("trajectory", 1.0, "")
-    trajectory = timed(world, found.paths, options.speed)
-    stances = tuple(Stance(contacts=k.stance) for k in found.keyframes)
-    skipped = ()
-    if found.missed:
-        skipped = (Skipped(stance=len(stances), reason=found.missed, missed=True),)
-    said = (found.missed, found.instead) if found.instead else ()
+    route = found.route
+    trajectory = timed(world, route.changes, options.speed)
+    stances = tuple(Stance(contacts=k.stance) for k in route.keyframes)
+    fallback = None
+    if found.instead:
+        reason = "; ".join(map(str, route.failures))
+        fallback = Fallback(reason=reason, source="secondary", tried=found.instead)
     return Plan(
         world=world,
         options=options,
@@ -164,13 +166,12 @@ def plan_traverse(
             stances=stances,
             t=np.arange(len(stances) + 1.0),
         ),
-        keyframes=found.keyframes,
-        paths=found.paths,
-        skipped=skipped,
+        start=route.start,
+        changes=numbered(route.changes),
+        failures=route.failures,
         trajectory=trajectory,
-        complete=found.arrived and bool(found.paths),
-        timings={},
-        instead="; ".join(filter(None, said)),
+        complete=route.arrived and bool(route.changes),
+        fallback=fallback,
         policy=policy,
         iterations=found.iterations,
     )
@@ -193,19 +194,21 @@ def follow_policy(
 
 
 def _follow(
-    tasks: Sequence[_Task], key: Keyframe, changes: int, report: Progress
+    tasks: Sequence[_Task], start: Keyframe, most: int, report: Progress
 ) -> Followed:
-    keyframes, paths, iterations, instead = [key], [], [], []
+    changes: list[Change] = []
+    iterations, instead = [], []
     task = tasks[0]
-    first = cost_to_go(key.stance, task.goal)
+    first = cost_to_go(start.stance, task.goal)
     missed, arrived = "", False
     best = math.inf
     since: list[tuple[Contact, ...]] = []  # stances since it last got nearer
-    while len(paths) < changes:
-        to_go = cost_to_go(keyframes[-1].stance, task.goal)
+    while len(changes) < most:
+        key = changes[-1].keyframe if changes else start
+        to_go = cost_to_go(key.stance, task.goal)
         nearer = to_go <= best - NEARER_BY
         best = to_go if nearer else min(best, to_go)
-        since = [*(() if nearer else since), keyframes[-1].stance]
+        since = [*(() if nearer else since), key.stance]
         if len(since) > PATIENCE + 1:
             missed = f"{PATIENCE} cycles bring it no nearer to the goal, {to_go:.2f} m"
             break
@@ -213,23 +216,22 @@ def _follow(
             missed = f"it only goes to and fro, {to_go:.2f} m from the goal"
             break
         share = 1.0 - min(to_go / max(first, 1e-9), 1.0)
-        report("plan", share, f"{to_go:.2f} m to go, {len(paths)} contact changes")
-        made, missed = _manoeuvre(task, keyframes[-1])
+        report("plan", share, f"{to_go:.2f} m to go, {len(changes)} contact changes")
+        made, missed = _manoeuvre(task, key)
         name = ""
         for k, other in enumerate(tasks[1:], start=1):
             if made or not missed:
                 break
-            made, _ = _manoeuvre(other, keyframes[-1])
+            made, _ = _manoeuvre(other, key)
             if made:
                 name = f"secondary {k}"
-                instead.append(f"{name} from change {len(paths) + 1} on ({missed})")
-        for after, path, option in made:
-            keyframes.append(after)
-            paths.append(path)
+                instead.append(f"{name} from change {len(changes) + 1} on ({missed})")
+        for change, option in made:
+            changes.append(change)
             iterations.append(
                 Iteration(
                     option=f"{option}, {name}" if name else option,
-                    cost=cost_to_go(after.stance, task.goal),
+                    cost=cost_to_go(change.keyframe.stance, task.goal),
                 )
             )
         if not made:
@@ -237,14 +239,14 @@ def _follow(
             break
         missed = ""
     else:
-        if len(paths) >= task.options.max_changes:
+        if len(changes) >= task.options.max_changes:
             missed = f"{task.options.max_changes} contact changes were not enough"
+    failures = (Failure(status=Status.STUCK, detail=missed),) if missed else ()
     return Followed(
-        keyframes=tuple(keyframes),
-        paths=tuple(paths),
+        route=Route(
+            start=start, changes=tuple(changes), failures=failures, arrived=arrived
+        ),
         iterations=tuple(iterations),
-        missed=missed,
-        arrived=arrived,
         instead="; ".join(instead),
     )
 
@@ -366,8 +368,8 @@ def _walk(
         if isinstance(found, str):
             why = found
             continue
-        key, path = found
-        made.append((key, path, task.policy.options[-1].name))
+        key = found.keyframe
+        made.append((found, task.policy.options[-1].name))
     return made, why
 
 
@@ -443,8 +445,8 @@ def _set_all(
                 left.append((surface, place))
                 why = found
                 continue
-            key, path = found
-            made.append((key, path, _option_with(task, surface).name))
+            key = found.keyframe
+            made.append((found, _option_with(task, surface).name))
         wanted = left
     return made, why
 
@@ -494,11 +496,10 @@ def _climb_up(
     steps, names = _left_of(task, key, rows)
     if not steps:
         return [], "nothing is left to climb with"
-    found, _ = search_steps(task.ik, steps, task.options, start=key)
-    made = list(zip(found.keyframes[1:], found.paths, names, strict=False))
-    if found.missed:
-        return [], found.missed[0].reason
-    return made, ""
+    found, _ = search_steps(task.ik, key, steps, task.options)
+    if found.failures:
+        return [], str(found.failures[0])
+    return list(zip(found.changes, names, strict=True)), ""
 
 
 def _ascent(task: _Task, edge: Edge, platform: Platform) -> list[tuple[Step, str]]:
@@ -571,33 +572,32 @@ def _descent(
     start = standing(task.ik, task.options.keyframe, at)
     rows = _ascent(task, edge, platform)
     steps = [s for s, _ in rows]
-    found, _ = search_steps(task.ik, steps, task.options, start=start)
-    if found.missed:
-        return found.missed[0].reason
+    found, _ = search_steps(task.ik, start, steps, task.options)
+    if found.failures:
+        return str(found.failures[0])
     home = home_at(world, at)
     out = []
-    for path, (_, name) in zip(found.paths[::-1], rows[::-1], strict=True):
-        t = path.transition
-        made = t.step.makes
+    for up, (_, name) in zip(found.changes[::-1], rows[::-1], strict=True):
+        made = up.step.makes
         assert made is not None
-        before = t.leaving[0] if t.leaving else None
-        seeds = Seeds(shifted=t.touching, touching=t.shifted)
+        before = up.leaving[0] if up.leaving else None
+        seeds = Seeds(shifted=up.touching, touching=up.shifted)
         reference = home if before is None else None
         out.append(
             (
                 Step(
-                    limb=t.step.limb,
+                    limb=up.step.limb,
                     breaks=(made.surface,),
                     makes=before,
                     fixed=True,
                     seeds=seeds,
                     reference=reference,
-                    stands_up=path is found.paths[0],
+                    stands_up=up is found.changes[0],
                 ),
                 name,
             )
         )
-    return found.keyframes[-1].stance, out
+    return found.end.stance, out
 
 
 def _climb_down(
@@ -623,12 +623,13 @@ def _climb_down(
         names.append(name)
     if not steps:
         return [], "nothing is left to climb down with"
-    found, _ = search_steps(task.ik, steps, task.options, start=key)
-    if found.missed:
+    found, _ = search_steps(task.ik, key, steps, task.options)
+    if found.failures:
+        why = str(found.failures[0])
         if any(c.support == GROUND for c in key.stance):
-            return [], found.missed[0].reason
-        return _rearranged(task, key, top), found.missed[0].reason
-    return list(zip(found.keyframes[1:], found.paths, names, strict=True)), ""
+            return [], why
+        return _rearranged(task, key, top), why
+    return list(zip(found.changes, names, strict=True)), ""
 
 
 def _rearranged(task: _Task, key: Keyframe, top: tuple[Contact, ...]) -> list[_Made]:
@@ -644,8 +645,8 @@ def _rearranged(task: _Task, key: Keyframe, top: tuple[Contact, ...]) -> list[_M
         place = Place(support=c.support, position=c.position)
         found = _attempt(task, key, c.surface, place, body, task.fours)
         if not isinstance(found, str):
-            key, path = found
-            made.append((key, path, option.name))
+            key = found.keyframe
+            made.append((found, option.name))
     return made
 
 
@@ -694,8 +695,8 @@ def _set_down(
             place = _place(task, platform, surface, wanted, platform.boxes)
             found = _attempt(task, key, surface, place, frame, task.fours)
             if not isinstance(found, str):
-                key, path = found
-                made.append((key, path, option.name))
+                key = found.keyframe
+                made.append((found, option.name))
                 break
     return made
 
@@ -832,7 +833,7 @@ def _brought_back(
     more of the weight and it is stretched less. Nothing, and why, where it is stuck
     even so.
     """
-    key, why = made[-1][0], ""
+    key, why = made[-1][0].keyframe, ""
     limb = task.ik.world.robot.limb_of(stuck).name
     on = _by_limb(task, key.stance)
     if limb not in on:
@@ -847,7 +848,7 @@ def _brought_back(
         around = _Frame(here - turn_about_z(body.yaw) @ offset, body.yaw)
         for group in groups:
             _cycle(task, now, platform, option, around, group, out, back=True)
-            now = out[-1][0]
+            now = out[-1][0].keyframe
             left, why = _cycle(task, now, platform, option, body, [stuck], out)
             if not left:
                 return out, ""
@@ -1008,11 +1009,11 @@ def _make(
     made: list[_Made],
 ) -> None:
     """Add to `made`, which begins at `key`, a contact by the first surface that can."""
-    key = made[-1][0] if made else key
+    key = made[-1][0].keyframe if made else key
     for surface in surfaces:
         found = _attempt(task, key, surface, place, body, task.fours, imposed=False)
         if not isinstance(found, str):
-            made.append((*found, option.name))
+            made.append((found, option.name))
             return
 
 
@@ -1031,7 +1032,7 @@ def _twice(
     made: list[_Made] = []
     left, why = _cycle(task, key, platform, option, body, surfaces, made, first=True)
     if left:
-        now = made[-1][0] if made else key
+        now = made[-1][0].keyframe if made else key
         left, why = _cycle(task, now, platform, option, body, left, made)
     return made, left, why
 
@@ -1090,8 +1091,8 @@ def _cycle(
             left.append(surface)
             why = found
             continue
-        key, path = found
-        made.append((key, path, option.name))
+        key = found.keyframe
+        made.append((found, option.name))
     return left, why
 
 
@@ -1123,7 +1124,7 @@ def _attempt(
     *,
     shares: Sequence[float] = SHRUNK,
     imposed: bool = True,
-) -> tuple[Keyframe, Path] | str:
+) -> Change | str:
     """Move one contact to a place, or part of the way there; or why not.
 
     A limb without a contact is set down there.
@@ -1150,17 +1151,11 @@ def _attempt(
             base_rotation=_pelvis(task, key, body) if imposed else None,
             reference=reference,
         )
-        found = plan_step(
-            task.ik,
-            key,
-            step,
-            task.options.method,
-            task.options.keyframe,
-            lambda stage: None,
-        )
-        if not isinstance(found, str):
+        options = task.options
+        found = change_contact(task.ik, key, step, options.keyframe, options.method)
+        if isinstance(found, Change):
             return found
-        why = found
+        why = str(found)
     return why
 
 

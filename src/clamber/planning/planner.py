@@ -6,7 +6,7 @@ sequence -> robot's scale -> moves -> keyframes -> transitions -> paths -> traje
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -19,16 +19,12 @@ from clamber.errors import InputError
 from clamber.model.robot import Robot
 from clamber.model.scene import Scene
 from clamber.model.world import World, build_world
-from clamber.planning.records import (
-    Plan,
-    PlanOptions,
-    Progress,
-)
-from clamber.planning.search import Found, plan_steps
+from clamber.planning.records import Plan, PlanOptions, Progress, Route
+from clamber.planning.search import follow_steps
 from clamber.planning.trajectory import Trajectory, build_trajectory
-from clamber.step.change import standing
+from clamber.step.change import Change, standing
 from clamber.step.ik import IK
-from clamber.step.path import Path, Phase, overlap, watched_pairs
+from clamber.step.path import Phase, overlap, watched_pairs
 from clamber.step.posture import Keyframe
 from clamber.step.stability import limiting_joint
 
@@ -68,63 +64,55 @@ def plan(
     world = build_world(robot, scene)
     ik = IK(world)
     check_reach(ik)
-    check_start(ik, standing(ik, options.keyframe))
+    start = standing(ik, options.keyframe)
+    check_start(ik, start)
     goal = retarget(sequence, world)
     clock.lap("retarget")
 
     steps, skipped = split_moves(goal, world)
-    found, used = search_steps(ik, steps, options, lap=clock.lap, report=report)
+    found, used = search_steps(ik, start, steps, options, report)
+    clock.lap("search")
     report("trajectory", 1.0, "")
-    trajectory = timed(world, found.paths, options.speed)
+    trajectory = timed(world, found.changes, options.speed)
     clock.lap("trajectory")
     return Plan(
         world=world,
         options=used,
         sequence=goal,
-        keyframes=found.keyframes,
-        paths=found.paths,
-        skipped=(*skipped, *found.missed),
+        start=found.start,
+        changes=found.changes,
+        skipped=tuple(skipped),
+        failures=found.failures,
         trajectory=trajectory,
-        complete=not found.missed and bool(found.paths),
+        complete=found.arrived and bool(found.changes),
         timings=clock.laps,
     )
 
 
 def search_steps(
     ik: IK,
+    start: Keyframe,
     steps: Sequence[Step],
     options: PlanOptions,
-    *,
-    start: Keyframe | None = None,
-    lap: Callable[[str], None] = lambda stage: None,
     report: Progress = lambda stage, share, note: None,
-) -> tuple[Found, PlanOptions]:
+) -> tuple[Route, PlanOptions]:
     """What the search finds with the weights that lead it farthest, and those.
 
     Args:
         ik: Workspace.
+        start: The keyframe to begin from.
         steps: To plan, in order.
         options: Of the plan; `VARIATIONS` of its weights are tried where it is stuck.
-        start: The keyframe to begin from; None: both feet where the robot starts.
-        lap: Called with the stage that has just ended, for timing.
         report: Called with stage, share and note, for progress.
     """
     found, used = None, options
     for factors in VARIATIONS:
         weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
         varied = replace(options, keyframe=replace(options.keyframe, **weights))
-        trial = plan_steps(
-            ik,
-            steps,
-            varied.method,
-            varied.keyframe,
-            lap=lap,
-            report=report,
-            start=start,
-        )
-        if found is None or len(trial.missed) < len(found.missed):
+        trial = follow_steps(ik, start, steps, varied, report)
+        if found is None or len(trial.failures) < len(found.failures):
             found, used = trial, varied
-        if not found.missed:
+        if found.arrived:
             break
     assert found is not None
     return found, used
@@ -132,25 +120,25 @@ def search_steps(
 
 def timed(
     world: World,
-    paths: Sequence[Path],
+    changes: Sequence[Change],
     speed: float | Literal["max"],
     lead: Sequence[Phase] = (),
 ) -> Trajectory | None:
-    """The trajectory of `lead`, which leads to the first keyframe, and the paths.
+    """The trajectory of `lead`, which leads to the first keyframe, and the changes.
 
     Args:
         world: Robot and scene.
-        paths: Between neighbouring keyframes.
+        changes: One after the other.
         speed: Largest joint speed [rad/s], or `max`.
-        lead: Phases before the first path.
+        lead: Phases before the first change.
 
     Returns:
         None where nothing moves.
     """
-    phases = [*lead, *(p for path in paths for p in path.phases)]
+    phases = [*lead, *(p for change in changes for p in change.phases)]
     if not phases:
         return None
-    ends = np.cumsum([len(lead), *(len(path.phases) for path in paths)])
+    ends = np.cumsum([len(lead), *(len(change.phases) for change in changes)])
     return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
 
 

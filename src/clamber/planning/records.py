@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -11,12 +11,12 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.policy import GeneralPolicy
 from clamber.contact.steps import Skipped
+from clamber.model.records import frozen_array, short_repr
 from clamber.model.world import World
 from clamber.planning.trajectory import Trajectory
-from clamber.step.path import Path
+from clamber.step.change import Change, Failure, Method
 from clamber.step.posture import Keyframe, KeyframeOptions
 
-Method = Literal["direct", "lbfgs", "gradient"]
 Progress = Callable[[str, float, str], None]
 
 
@@ -52,26 +52,96 @@ class Iteration:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Midway:
-    """Where a robot is in the middle of a climb.
+class State:
+    """Where a robot is: a plan may begin anywhere.
 
     Attributes:
-        made: Steps of the plan's sequence that have been made.
-        contacts: Its stance, each contact where it is.
+        stance: Its contacts, each where it is.
         loaded: Those of them that bear load already.
         q: (nq,) its posture.
+        done: Steps of the plan's sequence that it has done.
     """
 
-    made: int
-    contacts: tuple[Contact, ...]
+    stance: tuple[Contact, ...]
     loaded: tuple[Contact, ...]
     q: np.ndarray
+    done: int = 0
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Copy the posture and make it read-only."""
-        q = np.array(self.q, dtype=float)
-        q.setflags(write=False)
-        object.__setattr__(self, "q", q)
+        object.__setattr__(self, "q", frozen_array(self.q))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Route:
+    """What a search found, as far as it goes.
+
+    Attributes:
+        start: The keyframe that it begins from.
+        changes: One after the other.
+        failures: Steps left out because there is no way for them, or what it ends at.
+        arrived: It gets to where it should.
+    """
+
+    start: Keyframe
+    changes: tuple[Change, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    arrived: bool = False
+
+    __repr__ = short_repr
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """The start, then the one after each change."""
+        return (self.start, *(c.keyframe for c in self.changes))
+
+    @property
+    def end(self) -> Keyframe:
+        """The last keyframe."""
+        return self.changes[-1].keyframe if self.changes else self.start
+
+
+def numbered(
+    changes: Sequence[Change], index: int = 0, stance: int = 1
+) -> tuple[Change, ...]:
+    """The changes as the steps of a sequence that has a stance after each of them.
+
+    Args:
+        changes: In order.
+        index: Of the first one's step.
+        stance: That the first one leads to.
+    """
+    return tuple(
+        replace(c, step=replace(c.step, index=index + i, stance=stance + i))
+        for i, c in enumerate(changes)
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fallback:
+    """What took the place of what was asked for, and why; as a string, a clause.
+
+    Attributes:
+        reason: Why not as demonstrated; empty where nothing was missed.
+        source: Where the other contacts come from; None: there are none either.
+        surfaces: That make them.
+        tried: What was looked at, for people.
+    """
+
+    reason: str
+    source: Literal["alternatives", "search", "secondary"] | None = None
+    surfaces: tuple[str, ...] = ()
+    tried: str = ""
+
+    def __str__(self) -> str:
+        """Why, and what instead."""
+        how = {"alternatives": "of the alternatives", "search": "found by search"}
+        if self.source in how:
+            used = f"instead, {how[self.source]}: {', '.join(self.surfaces)}"
+            return f"{self.reason}; {used}"
+        return "; ".join(filter(None, (self.reason, self.tried)))
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -80,32 +150,48 @@ class Plan:
 
     Attributes:
         world: Robot and scene.
-        sequence: The demonstration in the robot's scene.
         options: With the weights of the search that got farthest.
-        keyframes: The start first; one more after each path.
-        paths: Between neighbouring keyframes.
-        skipped: Stances left out, and steps for which there is no way.
-        trajectory: None where not even one move was found.
-        complete: Every step that the demonstration asks for has a path.
-        timings: Seconds by stage.
-        midway: Where it begins, where that is not the scene's start: the rest of a
-            climb, from its first keyframe, which is settled into.
-        instead: Why it makes other contacts than the demonstrated ones, and which, or
-            where it followed a secondary policy; empty where it does not.
+        sequence: The demonstration in the robot's scene.
+        start: The keyframe that it begins with.
+        changes: Of contacts, one after the other.
+        skipped: Stances left out because there was nothing to do.
+        failures: Steps for which there is no way; what a policy is stuck at.
+        trajectory: None where nothing moves.
+        complete: Nothing is missed, and it gets to the end.
+        state: Where the robot is, where that is not the scene's start: it settles from
+            there into the first keyframe.
+        fallback: What it does that is not what was asked for.
         policy: That it was planned with; None where it follows a demonstration.
-        iterations: Of the policy, one for each path.
+        iterations: Of the policy, one for each change.
+        timings: Seconds by stage.
     """
 
     world: World
     options: PlanOptions
     sequence: ContactSequence
-    keyframes: tuple[Keyframe, ...]
-    paths: tuple[Path, ...]
-    skipped: tuple[Skipped, ...]
+    start: Keyframe
+    changes: tuple[Change, ...] = ()
+    skipped: tuple[Skipped, ...] = ()
+    failures: tuple[Failure, ...] = ()
     trajectory: Trajectory | None
     complete: bool
-    timings: dict[str, float]
-    midway: Midway | None = None
-    instead: str = ""
+    state: State | None = None
+    fallback: Fallback | None = None
     policy: GeneralPolicy | None = None
     iterations: tuple[Iteration, ...] = ()
+    timings: dict[str, float] = field(default_factory=dict)
+
+    __repr__ = short_repr
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """The start, then the one after each change."""
+        return (self.start, *(c.keyframe for c in self.changes))
+
+    @property
+    def why_not(self) -> str:
+        """Why it is not complete: the first reason there is; empty where it is."""
+        if self.complete:
+            return ""
+        reasons = (*map(str, self.failures), *(s.reason for s in self.skipped))
+        return next(iter(reasons), "there is no move in it")

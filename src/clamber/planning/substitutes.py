@@ -20,6 +20,7 @@ same order: as it was, with other surfaces, by the search.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,25 +28,32 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.contact.scaling import retarget
-from clamber.contact.steps import Skipped, Step, split_moves
-from clamber.errors import InputError
+from clamber.contact.steps import split_moves
+from clamber.errors import InputError, Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.robot import Robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World, build_world
-from clamber.planning.adaptation import adapt_plan, felt_contact, settle
+from clamber.planning.adaptation import adapt_plan, felt_contact, from_here, settle
 from clamber.planning.free import (
     Bounds,
     Counts,
     Explored,
-    Reached,
     action_counts,
     explore,
 )
 from clamber.planning.planner import plan, search_steps, timed
-from clamber.planning.records import Midway, Plan, PlanOptions, Progress
-from clamber.planning.search import Found, plan_steps
+from clamber.planning.records import (
+    Fallback,
+    Plan,
+    PlanOptions,
+    Progress,
+    Route,
+    State,
+    numbered,
+)
+from clamber.planning.search import follow_steps
 from clamber.step.change import standing
 from clamber.step.ik import IK
 from clamber.step.path import Phase
@@ -223,28 +231,24 @@ def plan_cost(made: Plan) -> float:
     """
     world = made.world
     kin = Kinematics(world)
-    steps = split_moves(made.sequence, world)[0]
-    k = 0 if made.midway is None else made.midway.made
     total = 0.0
-    for before, after, path in zip(
-        made.keyframes, made.keyframes[1:], made.paths, strict=False
-    ):
-        c = path.transition.step.makes
+    q = made.start.q
+    for change in made.changes:
+        c = change.step.makes
         if c is not None:
             d = next(
                 s.projected_distance
-                for s in after.contacts
+                for s in change.keyframe.contacts
                 if s.contact.surface == c.surface
             )
-            total += _way(kin, before.q, c) + d
-    for step in _missed(steps[k:], made):
-        c = step.makes
-        if c is None:
-            continue
-        q = made.keyframes[-1].q if made.keyframes else world.home
-        total += _way(kin, q, c)
-        root = kin.landmark(world.robot.limb_of(c.surface).root)[1]
-        total += projected_distance(c.position, root)
+            total += _way(kin, q, c) + d
+        q = change.keyframe.q
+    for step in (f.step for f in made.failures):
+        c = None if step is None else step.makes
+        if c is not None:
+            total += _way(kin, q, c)
+            root = kin.landmark(world.robot.limb_of(c.surface).root)[1]
+            total += projected_distance(c.position, root)
     return total
 
 
@@ -253,27 +257,6 @@ def _way(kin: Kinematics, q: np.ndarray, c: Contact) -> float:
     kin.update(q)
     p = kin.contact_point(c.surface, kin.world.supports[c.support].normal)
     return float(np.linalg.norm(p - c.position))
-
-
-def _missed(steps: Sequence[Step], made: Plan) -> list[Step]:
-    """Steps that no path of the plan makes."""
-    moves = [p.transition.step for p in made.paths]
-    out = []
-    for step in steps:
-        m = moves[0] if moves else None
-        if (
-            m is not None
-            and m.limb == step.limb
-            and _made(m.makes) == _made(step.makes)
-        ):
-            moves.pop(0)
-        else:
-            out.append(step)
-    return out
-
-
-def _made(c: Contact | None) -> tuple[str, str] | None:
-    return None if c is None else (c.surface, c.support)
 
 
 def replan(
@@ -344,8 +327,8 @@ def _replanned(
                 found = Alternative(
                     surfaces=_surfaces(explored), sequence=explored.sequence
                 )
-                plan_found = _plan_of(ik.world, options, explored.sequence, explored)
-                planned.append((found, plan_found))
+                new = _plan_of(ik.world, options, found.sequence, explored.route)
+                planned.append((found, replace(new, changes=numbered(new.changes))))
     ranked = _ranked(planned)
     return Replanned(
         differences=contact_differences(sequence), ranked=ranked, explored=explored
@@ -366,9 +349,10 @@ def _search_on(
     Where that is nothing, or none came anywhere, what it finds from the start.
     """
     goal = retarget(sequence, ik.world)
-    stuck = max(map(_reached, made), key=lambda x: len(x.steps))
+    begin = Route(start=standing(ik, options.keyframe))
+    stuck = max(map(_reached, made), key=lambda x: len(x.changes))
     explored = None
-    for start in (stuck, None) if stuck.steps else (None,):
+    for start in (stuck, begin) if stuck.changes else (begin,):
         explored = _explored(ik, goal, options, bounds, counts, start, report)
         if explored is None or explored.sequence is not None:
             break
@@ -379,39 +363,21 @@ def _planned_once(ik: IK, sequence: ContactSequence, options: PlanOptions) -> Pl
     """The plan of a sequence with these weights and no others."""
     goal = retarget(sequence, ik.world)
     steps, skipped = split_moves(goal, ik.world)
-    found = plan_steps(
-        ik,
-        steps,
-        options.method,
-        options.keyframe,
-        lap=lambda stage: None,
-        report=_silent,
-    )
-    made = _plan_of(ik.world, options, goal, found)
-    return replace(made, skipped=(*skipped, *made.skipped))
+    start = standing(ik, options.keyframe)
+    found = follow_steps(ik, start, steps, options, _silent)
+    return replace(_plan_of(ik.world, options, goal, found), skipped=tuple(skipped))
 
 
-def _reached(made: Plan) -> Reached:
+def _reached(made: Plan) -> Route:
     """What a plan does before the first step that it misses."""
-    steps: list[Step] = []
-    for path, step in zip(
-        made.paths, split_moves(made.sequence, made.world)[0], strict=False
-    ):
-        made_step = path.transition.step
-        if made_step.limb != step.limb or _made(made_step.makes) != _made(step.makes):
-            break
-        steps.append(
-            replace(
-                step,
-                breaks=made_step.breaks,
-                makes=made_step.makes,
-                fixed=made_step.fixed,
-            )
-        )
-    n = len(steps)
-    return Reached(
-        keyframes=made.keyframes[: n + 1], paths=made.paths[:n], steps=tuple(steps)
-    )
+    steps = [f.step for f in made.failures if f.step is not None]
+    first = min((s.index for s in steps if s.index is not None), default=math.inf)
+    changes = [c for c in made.changes if (c.step.index or 0) < first]
+    return Route(start=made.start, changes=tuple(changes))
+
+
+def _made(c: Contact | None) -> tuple[str, str] | None:
+    return None if c is None else (c.surface, c.support)
 
 
 def _silent(stage: str, share: float, note: str) -> None:
@@ -430,7 +396,7 @@ def _explored(
     options: PlanOptions,
     bounds: Bounds | None,
     counts: Counts | None,
-    start: Reached | None,
+    start: Route,
     report: Progress,
 ) -> Explored | None:
     """What the search finds; None where it is not wanted."""
@@ -439,36 +405,34 @@ def _explored(
         return None
     if counts is None:
         counts = action_counts(goal, ik.world)
-    return explore(ik, goal, options, counts, bounds, start=start, report=report)
+    return explore(ik, goal, options, counts, bounds, start, report=report)
 
 
 def _plan_of(
     world: World,
     options: PlanOptions,
     sequence: ContactSequence,
-    found: Found | Explored,
-    midway: Midway | None = None,
+    found: Route,
+    state: State | None = None,
     lead: Sequence[Phase] = (),
 ) -> Plan:
-    """The plan of keyframes and paths that were found."""
-    missed = found.missed if isinstance(found, Found) else ()
+    """The plan of a route."""
     return Plan(
         world=world,
         options=options,
         sequence=sequence,
-        keyframes=found.keyframes,
-        paths=found.paths,
-        skipped=missed,
-        trajectory=timed(world, found.paths, options.speed, lead),
-        complete=not missed,
-        timings={},
-        midway=midway,
+        start=found.start,
+        changes=found.changes,
+        failures=found.failures,
+        trajectory=timed(world, found.changes, options.speed, lead),
+        complete=found.arrived,
+        state=state,
     )
 
 
 def _surfaces(explored: Explored) -> tuple[str, ...]:
     """Surfaces that make contacts, in order."""
-    moves = (p.transition.step for p in explored.paths)
+    moves = (c.step for c in explored.route.changes)
     return tuple(m.makes.surface for m in moves if m.makes is not None)
 
 
@@ -484,8 +448,8 @@ def plan_or_replan(
 ) -> Plan:
     """The demonstrated contacts; where they have no stable plan, the best others.
 
-    `Plan.instead` says so. Where there are no others either it is the plan of the
-    demonstrated ones, and its last skipped stance says what was tried.
+    `Plan.fallback` says so. Where there are no others either it is the plan of the
+    demonstrated ones.
 
     Raises:
         InputError: The scene does not fit the sequence, or is out of the robot's reach.
@@ -493,21 +457,18 @@ def plan_or_replan(
     options = options or PlanOptions()
     report = progress or _silent
     first = plan(sequence, robot, scene, options=options, progress=report)
-    why = _why_not(first)
-    if first.complete or not why:
+    if first.complete or not first.failures:
         return first
+    why = f"no stable plan as demonstrated ({first.failures[0]})"
     found = _replanned(sequence, robot, scene, options, bounds, counts, report, first)
     if not found.best.stable:
-        return replace(first, instead=f"{why}; {described(found)}")
-    how = "of the alternatives" if found.explored is None else "found by search"
-    used = f"instead, {how}: {', '.join(found.best.surfaces)}"
-    return replace(found.best.plan, instead=f"{why}; {used}")
-
-
-def _why_not(made: Plan) -> str:
-    """Why a plan is not complete; empty where no step is missed."""
-    missed = [s.reason for s in made.skipped if s.missed]
-    return f"no stable plan as demonstrated ({missed[0]})" if missed else ""
+        return replace(first, fallback=Fallback(reason=why, tried=described(found)))
+    fallback = Fallback(
+        reason=why,
+        source="alternatives" if found.explored is None else "search",
+        surfaces=found.best.surfaces,
+    )
+    return replace(found.best.plan, fallback=fallback)
 
 
 def described(found: Replanned) -> str:
@@ -527,7 +488,7 @@ def described(found: Replanned) -> str:
 
 def replan_rest(
     made: Plan,
-    now: Midway,
+    now: State,
     scene: Scene,
     *,
     bounds: Bounds | None = None,
@@ -541,7 +502,7 @@ def replan_rest(
 
     Args:
         made: The plan that the robot was following.
-        now: Where it is (`midway_of`).
+        now: Where it is (`state_of`).
         scene: As it is now.
         bounds: Of the search.
         counts: How often a demonstration takes an action, for the search.
@@ -552,74 +513,44 @@ def replan_rest(
     """
     report = progress or _silent
     report("replan", 0.0, "the steps that are left")
-    adapted = adapt_plan(made, scene, now, now.q)
-    world, options = adapted.world, made.options
+    first = adapt_plan(made, scene, now, now.q)
+    world, options = first.world, made.options
     sequence = retarget(made.sequence, world)
-    missed = ()
-    if adapted.missed:
-        missed = (Skipped(stance=0, reason=adapted.missed, missed=True),)
-    first = Plan(
-        world=world,
-        options=options,
-        sequence=sequence,
-        keyframes=adapted.keyframes,
-        paths=adapted.paths,
-        skipped=missed,
-        trajectory=adapted.trajectory,
-        complete=not missed,
-        timings={},
-        midway=now,
-    )
-    if first.complete:
+    if first.complete or not first.failures:
         return first
     ik = IK(world)
-    settled = settle(ik, now, now.q, options)
-    if isinstance(settled, str):
+    start, lead = settle(ik, now, now.q, options)
+    if start.status is not Status.SOLVED:
         return first
-    why = _why_not(first)
-    start, lead = settled
+    why = f"no stable plan as demonstrated ({first.failures[0]})"
     planned = []
     candidates = contact_alternatives(sequence, world.robot)
     for i, a in enumerate(candidates if len(candidates) > 1 else ()):
         report("replan", i / len(candidates), ", ".join(a.surfaces))
-        here = replace(now, made=steps_made(a.sequence, world, now.contacts))
-        steps = split_moves(a.sequence, world)[0][here.made :]
-        steps = _leaving(steps, now.contacts, world)
-        found, used = search_steps(ik, steps, options, start=start)
+        here = replace(now, done=steps_made(a.sequence, world, now.stance))
+        steps = split_moves(a.sequence, world)[0][here.done :]
+        steps = from_here(steps, now.stance, world)
+        found, used = search_steps(ik, start, steps, options)
         planned.append((a, _plan_of(world, used, a.sequence, found, here, lead)))
     report("replan", 1.0, "")
     ranked = _ranked(planned)
     if ranked and ranked[0].stable:
-        used = ", ".join(ranked[0].surfaces)
-        return replace(
-            ranked[0].plan, instead=f"{why}; instead, of the alternatives: {used}"
-        )
-    here = Reached(keyframes=(start,))
-    explored = _explored(ik, sequence, options, bounds, counts, here, report)
-    tried = described(Replanned(differences=(), ranked=ranked, explored=explored))
+        surfaces = ranked[0].surfaces
+        fallback = Fallback(reason=why, source="alternatives", surfaces=surfaces)
+        return replace(ranked[0].plan, fallback=fallback)
+    begin = Route(start=start)
+    explored = _explored(ik, sequence, options, bounds, counts, begin, report)
     if explored is None or explored.sequence is None:
-        return replace(first, instead=f"{why}; {tried}")
+        tried = Replanned(differences=(), ranked=ranked, explored=explored)
+        return replace(first, fallback=Fallback(reason=why, tried=described(tried)))
     whole, k = _from_standing(ik, explored.sequence, options)
-    used = ", ".join(_surfaces(explored))
+    found = _plan_of(world, options, whole, explored.route, replace(now, done=k), lead)
+    first = len(whole.stances) - len(explored.route.changes)
     return replace(
-        _plan_of(world, options, whole, explored, replace(now, made=k), lead),
-        instead=f"{why}; instead, found by search: {used}",
+        found,
+        changes=numbered(found.changes, k, first),
+        fallback=Fallback(reason=why, source="search", surfaces=_surfaces(explored)),
     )
-
-
-def _leaving(
-    steps: Sequence[Step], stance: Sequence[Contact], world: World
-) -> list[Step]:
-    """The steps of an alternative, where each limb leaves what it is really on.
-
-    It may be on a surface that the alternative does without.
-    """
-    on = {world.robot.limb_of(c.surface).name: (c.surface,) for c in stance}
-    out = []
-    for step in steps:
-        breaks = on.pop(step.limb, step.breaks)
-        out.append(replace(step, breaks=breaks))
-    return out
 
 
 def _from_standing(
@@ -645,14 +576,14 @@ def _from_standing(
     return whole, sum(s.stance <= before for s in steps)
 
 
-def midway_of(
+def state_of(
     plan: Plan,
     scene: Scene,
     q: np.ndarray,
     touching: Mapping[str, str] | None = None,
     *,
     source: object = "state",
-) -> Midway:
+) -> State:
     """Where a robot is in a plan, from its posture.
 
     Args:
@@ -690,11 +621,11 @@ def midway_of(
             "a posture with a surface on a support", source=source, field="contacts"
         )
     stance = tuple(contacts)
-    return Midway(
-        made=steps_made(plan.sequence, plan.world, stance),
-        contacts=stance,
+    return State(
+        stance=stance,
         loaded=stance,
         q=q,
+        done=steps_made(plan.sequence, plan.world, stance),
     )
 
 

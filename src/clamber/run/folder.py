@@ -18,10 +18,10 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import IO, Any, TypeVar, get_args, get_type_hints
+from typing import IO, Annotated, Any, Literal, TypeVar, get_args, get_type_hints
 from xml.etree import ElementTree
 
 import mujoco
@@ -42,7 +42,7 @@ from clamber.contact.policy import (
     PelvisDistribution,
     Place,
 )
-from clamber.contact.steps import Skipped
+from clamber.contact.steps import Seeds, Skipped, Step
 from clamber.errors import InputError, Status, input_error, read_yaml, unreadable
 from clamber.execution.events import EVENTS, Event, event_fields
 from clamber.execution.simulation import Rollout
@@ -54,10 +54,12 @@ from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
-from clamber.planning.records import Iteration, Midway, Plan, PlanOptions
+from clamber.planning.records import Fallback, Iteration, Plan, PlanOptions, State
 from clamber.planning.substitutes import Replanned
 from clamber.planning.trajectory import Samples, Segment, Trajectory
+from clamber.step.change import Change, Failure
 from clamber.step.ik import Residuals
+from clamber.step.path import contact_phases
 from clamber.step.posture import Keyframe
 from clamber.step.stability import ContactState, contact_points
 from clamber.step.statics import Phase, StaticEquilibrium
@@ -700,6 +702,15 @@ class _ResidualsFile(pydantic.BaseModel):
     worst_pair: int
 
 
+def _known(status: str) -> str:
+    if status not in Status.__members__:
+        raise ValueError(f"one of {', '.join(Status.__members__)}")
+    return status
+
+
+_StatusName = Annotated[str, pydantic.AfterValidator(_known)]
+
+
 class _KeyframeFile(pydantic.BaseModel):
     qpos: list[float]
     contacts: list[_StateFile]
@@ -711,14 +722,7 @@ class _KeyframeFile(pydantic.BaseModel):
     iterations: int
     cost_before: float
     cost_after: float
-    status: str
-
-    @pydantic.field_validator("status")
-    @classmethod
-    def _known(cls, status: str) -> str:
-        if status not in Status.__members__:
-            raise ValueError(f"one of {', '.join(Status.__members__)}")
-        return status
+    status: _StatusName
 
     def keyframe(self) -> Keyframe:
         e = self.static_equilibrium
@@ -755,23 +759,100 @@ class _KeyframeFile(pydantic.BaseModel):
 class _SkippedFile(pydantic.BaseModel):
     stance: int
     reason: str
-    missed: bool = False
 
 
-class _MidwayFile(pydantic.BaseModel):
-    made: int = pydantic.Field(ge=0)
+class _PlaceFile(pydantic.BaseModel):
+    """Where a robot is."""
+
+    done: int = pydantic.Field(ge=0)
     qpos: list[float]
     contacts: list[_ContactFile]
     loaded: list[str]
 
-    def midway(self) -> Midway:
-        contacts = tuple(c.contact() for c in self.contacts)
-        return Midway(
-            made=self.made,
-            contacts=contacts,
-            loaded=tuple(c for c in contacts if c.surface in self.loaded),
+    def state(self) -> State:
+        stance = tuple(c.contact() for c in self.contacts)
+        return State(
+            done=self.done,
+            stance=stance,
+            loaded=tuple(c for c in stance if c.surface in self.loaded),
             q=np.array(self.qpos),
         )
+
+
+Postures = list[list[float]]
+
+
+class _StepFile(pydantic.BaseModel):
+    index: int | None
+    stance: int
+    target: _StateOfFile
+    limb: str
+    breaks: tuple[str, ...]
+    makes: _ContactFile | None
+    fixed: bool
+    seeds: dict[Literal["shifted", "touching"], list[float]] = {}
+    base_rotation: list[Vector] | None = None
+    reference: list[float] | None = None
+    stands_up: bool
+
+    def step(self) -> Step:
+        return Step(
+            index=self.index,
+            stance=self.stance,
+            target=self.target.stance(),
+            limb=self.limb,
+            breaks=self.breaks,
+            makes=None if self.makes is None else self.makes.contact(),
+            fixed=self.fixed,
+            seeds=Seeds(**{k: np.array(q) for k, q in self.seeds.items()}),
+            base_rotation=_array(self.base_rotation),
+            reference=_array(self.reference),
+            stands_up=self.stands_up,
+        )
+
+
+def _array(x: Sequence[Any] | None) -> np.ndarray | None:
+    return None if x is None else np.array(x)
+
+
+class _ChangeFile(pydantic.BaseModel):
+    step: _StepFile
+    margin: float
+    held: list[_ContactFile]
+    rolling: list[_ContactFile]
+    shift: Postures
+    swing: Postures
+    settle: Postures
+    arc: list[Vector]
+
+    def change(self, before: Keyframe, after: Keyframe) -> Change:
+        step = self.step.step()
+        phases = contact_phases(
+            before.stance,
+            tuple(c.contact() for c in self.held),
+            tuple(c.contact() for c in self.rolling),
+            step.makes,
+            [np.array(q) for q in (self.shift, self.swing, self.settle)],
+            np.array(self.arc).reshape(-1, 3),
+        )
+        return Change(step=step, keyframe=after, phases=phases, margin=self.margin)
+
+
+class _FailureFile(pydantic.BaseModel):
+    status: _StatusName
+    step: _StepFile | None
+    detail: str
+
+    def failure(self) -> Failure:
+        step = None if self.step is None else self.step.step()
+        return Failure(status=Status[self.status], step=step, detail=self.detail)
+
+
+class _FallbackFile(pydantic.BaseModel):
+    reason: str
+    source: Literal["alternatives", "search", "secondary"] | None
+    surfaces: tuple[str, ...]
+    tried: str
 
 
 class _IterationFile(pydantic.BaseModel):
@@ -784,10 +865,12 @@ class _PlanFile(pydantic.BaseModel):
     robot: RobotFile
     sequence: _SequenceFile
     keyframes: list[_KeyframeFile] = pydantic.Field(min_length=1)
+    changes: list[_ChangeFile]
     skipped: list[_SkippedFile]
+    failures: list[_FailureFile]
     complete: bool
-    midway: _MidwayFile | None = None
-    instead: str = ""
+    state: _PlaceFile | None = None
+    fallback: _FallbackFile | None = None
     policy: _GeneralFile | None = None
     iterations: list[_IterationFile] = []
 
@@ -831,15 +914,9 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "robot": robot,
         "prefixes": dict(world.robot.prefixes),
         "keyframes": [keyframe_fields(k, kin) for k in plan.keyframes],
-        "moves": [
-            {
-                "limb": m.limb,
-                "breaks": m.breaks,
-                "makes": None if m.makes is None else contact_fields(m.makes),
-            }
-            for m in (p.transition.step for p in plan.paths)
-        ],
+        "changes": [_change_fields(c) for c in plan.changes],
         "skipped": [asdict(s) for s in plan.skipped],
+        "failures": [_failure_fields(f) for f in plan.failures],
         "sequence": sequence_fields(plan.sequence)
         | {"scene": scene_fields(world.scene)},
     } | _other_plan_fields(plan)
@@ -847,18 +924,70 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
 
 def _other_plan_fields(plan: Plan) -> dict[str, Any]:
     """What a plan has that is not of a whole climb as demonstrated."""
-    out: dict[str, Any] = {"instead": plan.instead} if plan.instead else {}
-    if plan.midway is not None:
-        out["midway"] = {
-            "made": plan.midway.made,
-            "qpos": plan.midway.q,
-            "contacts": [contact_fields(c) for c in plan.midway.contacts],
-            "loaded": [c.surface for c in plan.midway.loaded],
+    out: dict[str, Any] = {}
+    if plan.fallback is not None:
+        out["fallback"] = asdict(plan.fallback)
+    if plan.state is not None:
+        out["state"] = {
+            "done": plan.state.done,
+            "qpos": plan.state.q,
+            "contacts": [contact_fields(c) for c in plan.state.stance],
+            "loaded": [c.surface for c in plan.state.loaded],
         }
     if plan.policy is not None:
         out["policy"] = policy_fields(plan.policy)
         out["iterations"] = [asdict(i) for i in plan.iterations]
     return out
+
+
+def _step_fields(s: Step) -> dict[str, Any]:
+    """A step by the keys of `plan.json`."""
+    seeds = {"shifted": s.seeds.shifted, "touching": s.seeds.touching}
+    return {
+        "index": s.index,
+        "stance": s.stance,
+        "target": _stance_fields(s.target),
+        "limb": s.limb,
+        "breaks": s.breaks,
+        "makes": None if s.makes is None else contact_fields(s.makes),
+        "fixed": s.fixed,
+        "seeds": {k: q for k, q in seeds.items() if q is not None},
+        "base_rotation": s.base_rotation,
+        "reference": s.reference,
+        "stands_up": s.stands_up,
+    }
+
+
+def _change_fields(c: Change) -> dict[str, Any]:
+    """A contact change by the keys of `plan.json`; its keyframe stands elsewhere."""
+    shift, swing, settle = c.phases
+    return {
+        "step": _step_fields(c.step),
+        "margin": c.margin,
+        "held": [contact_fields(x) for x in swing.contacts],
+        "rolling": [contact_fields(x) for x in shift.contacts[len(swing.contacts) :]],
+        "shift": shift.q,
+        "swing": swing.q,
+        "settle": settle.q,
+        "arc": swing.arc,
+    }
+
+
+def _failure_fields(f: Failure) -> dict[str, Any]:
+    """A failure by the keys of `plan.json`, and as a sentence."""
+    return {
+        "stance": None if f.step is None else f.step.stance,
+        "reason": str(f),
+        "status": f.status.name,
+        "detail": f.detail,
+        "step": None if f.step is None else _step_fields(f.step),
+    }
+
+
+def fallback_note(written: Mapping[str, Any]) -> str:
+    """What the fields of a `plan.json` say of its fallback; empty without one."""
+    fields = written.get("fallback")
+    return "" if fields is None else str(Fallback(**fields))
 
 
 def _robot_fields(robot: Robot) -> dict[str, Any]:
@@ -982,7 +1111,7 @@ def save_proposal(proposal: Proposal, folder: str | Path) -> None:
 
 
 def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
-    """Read what `save_plan` wrote, all but the paths.
+    """Read what `save_plan` wrote.
 
     World and trajectory are the planned ones, whatever a run has made of them since.
 
@@ -1007,21 +1136,19 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     scene, followed = _planned(folder)
     world = _load_world(scene, _robot(file.robot), sequence.scene)
     nq = world.model.nq
-    if file.midway is not None and len(file.midway.qpos) != nq:
+    if len(file.changes) + 1 != len(file.keyframes):
         raise InputError(
-            f"{nq} numbers, as many as {SCENE} has coordinates",
-            source=path,
-            field="midway.qpos",
-            value=f"{len(file.midway.qpos)} numbers",
+            "a change between neighbouring keyframes", source=path, field="changes"
         )
-    for i, k in enumerate(file.keyframes):
-        if len(k.qpos) != nq:
+    for field, q in _postures(file):
+        if len(q) != nq:
             raise InputError(
                 f"{nq} numbers, as many as {SCENE} has coordinates",
                 source=path,
-                field=f"keyframes.{i}.qpos",
-                value=f"{len(k.qpos)} numbers",
+                field=field,
+                value=f"{len(q)} numbers",
             )
+    for i, k in enumerate(file.keyframes):
         for c in k.contacts:
             known = c.surface in world.surfaces and c.support in world.supports
             if not known:
@@ -1037,21 +1164,40 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     timings: dict[str, float] = {}
     if TIMINGS not in without and (folder / TIMINGS).exists():
         timings = _read_json(folder / TIMINGS, _TimingsFile).seconds
+    keys = [k.keyframe() for k in file.keyframes]
     return Plan(
         world=world,
         options=options,
         sequence=sequence,
-        keyframes=tuple(k.keyframe() for k in file.keyframes),
-        paths=(),
+        start=keys[0],
+        changes=tuple(
+            c.change(before, after)
+            for c, before, after in zip(file.changes, keys, keys[1:], strict=False)
+        ),
         skipped=tuple(Skipped(**s.model_dump()) for s in file.skipped),
+        failures=tuple(f.failure() for f in file.failures),
         trajectory=trajectory,
         complete=file.complete,
         timings=timings,
-        midway=None if file.midway is None else file.midway.midway(),
-        instead=file.instead,
+        state=None if file.state is None else file.state.state(),
+        fallback=None
+        if file.fallback is None
+        else Fallback(**file.fallback.model_dump()),
         policy=None if file.policy is None else file.policy.policy(path, "policy."),
         iterations=tuple(Iteration(**i.model_dump()) for i in file.iterations),
     )
+
+
+def _postures(file: _PlanFile) -> Iterator[tuple[str, list[float]]]:
+    """Every posture of a plan and the name of its field."""
+    if file.state is not None:
+        yield "state.qpos", file.state.qpos
+    for i, k in enumerate(file.keyframes):
+        yield f"keyframes.{i}.qpos", k.qpos
+    for i, c in enumerate(file.changes):
+        for name in ("shift", "swing", "settle"):
+            for q in getattr(c, name):
+                yield f"changes.{i}.{name}", q
 
 
 def _planned(folder: Path) -> tuple[Path, Path]:
@@ -1229,8 +1375,8 @@ def save_replanned(found: Replanned, folder: str | Path) -> None:
                     "surfaces": r.surfaces,
                     "cost": r.cost,
                     "stable": r.stable,
-                    "moves": [str(p.transition.step) for p in r.plan.paths],
-                    "missed": [s.reason for s in r.plan.skipped if s.missed],
+                    "moves": [str(c.step) for c in r.plan.changes],
+                    "missed": [str(f) for f in r.plan.failures],
                 }
                 for r in found.ranked
             ],

@@ -55,7 +55,7 @@ class Editor:
         self._done: tuple[Rollout, Verdict] | None = None
         self._busy = threading.Lock()
         gui = page.server.gui
-        if plan.midway is not None:
+        if plan.state is not None:
             text = "The rest of a climb is not edited: edit the plan of the whole one."
             gui.add_html(paragraphs([text]))
             return
@@ -169,9 +169,8 @@ class Editor:
         self._done = None
         self._replaced(plan, None)
         if plan.complete:
-            return f"Planned to the last stance: {len(plan.paths)} changes."
-        missed = [s.reason for s in plan.skipped if s.missed] or ["no change in it"]
-        return f"No plan to the last stance: {missed[0]}"
+            return f"Planned to the last stance: {len(plan.changes)} changes."
+        return f"No plan to the last stance: {plan.why_not}"
 
     def _run_physics(self) -> str:
         assert self._new is not None

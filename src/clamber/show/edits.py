@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
-from clamber.contact.steps import Step, same_place, split_moves
+from clamber.contact.steps import Step, same_place
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
 from clamber.model.scene import Support
@@ -110,18 +110,8 @@ def intervals_of(made: Plan) -> tuple[Interval, ...]:
 
 def keyframe_steps(made: Plan) -> list[tuple[int, Step]]:
     """Index of each keyframe that a step of the sequence leads to, and that step."""
-    steps = split_moves(made.sequence, made.world)[0]
-    out, k = [], 0
-    for i in range(1, len(made.keyframes)):
-        before = {c.surface for c in made.keyframes[i - 1].stance}
-        new = [c.surface for c in made.keyframes[i].stance if c.surface not in before]
-        for j in range(k, len(steps)):
-            makes = steps[j].makes
-            if (None if makes is None else makes.surface) in (new or [None]):
-                out.append((i, steps[j]))
-                k = j + 1
-                break
-    return out
+    steps = [(i, c.step) for i, c in enumerate(made.changes, start=1)]
+    return [(i, step) for i, step in steps if step.index is not None]
 
 
 def clamped(support: Support, point: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
-from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, whole_file
+from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, fallback_note, whole_file
 from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.pictures import FORCE_LENGTH
 from clamber.show.renderer import PRESETS, seen_points
@@ -185,9 +185,9 @@ def run_record(folder: Path) -> dict[str, Any]:
         "adapted": rollout is not None
         and rollout.followed is not None
         and bool(rollout.events),
-        "instead": written.get("instead", ""),
+        "instead": fallback_note(written),
         "keyframes": stance_rows(written, times),
-        "skipped": written.get("skipped", []),
+        "skipped": [*written.get("skipped", ()), *written.get("failures", ())],
         "options": _flat(written.get("options")),
         "versions": _flat(written.get("versions")),
         "inputs": _flat(written.get("inputs")),

@@ -1,21 +1,23 @@
-"""One contact change: keyframe, transition and path to it, or why there is none."""
+"""One contact change: the next keyframe and the way to it, or why there is none."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.contact.steps import Step
 from clamber.errors import Status
+from clamber.model.records import short_repr
 from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
 from clamber.model.world import World
 from clamber.step import direct, gradient, lbfgs
 from clamber.step.ik import IK, support_rotation
-from clamber.step.path import Path, plan_path
+from clamber.step.path import Phase, plan_path
 from clamber.step.posture import (
     Keyframe,
     KeyframeOptions,
@@ -30,11 +32,69 @@ from clamber.step.transition import (
     rolled,
 )
 
+Method = Literal["direct", "lbfgs", "gradient"]
 METHODS = {
     "direct": direct.optimise,
     "lbfgs": lbfgs.optimise,
     "gradient": gradient.optimise,
 }
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Change:
+    """One contact change that is possible.
+
+    Attributes:
+        step: What changes, its contact where it is made.
+        keyframe: The posture after it.
+        phases: The way there: shift of the weight, swing of the limb, settling.
+        margin: Of the centre of mass to the border of its polygon, throughout [m].
+    """
+
+    step: Step
+    keyframe: Keyframe
+    phases: tuple[Phase, ...]
+    margin: float
+
+    __repr__ = short_repr
+
+    @property
+    def leaving(self) -> tuple[Contact, ...]:
+        """Contacts that are broken, as they were."""
+        breaks = self.step.breaks
+        return tuple(c for c in self.phases[0].load_before if c.surface in breaks)
+
+    @property
+    def shifted(self) -> np.ndarray:
+        """(nq,) the weight on the contacts that stay."""
+        return self.phases[0].q[-1]
+
+    @property
+    def touching(self) -> np.ndarray:
+        """(nq,) the new contact closed, not loaded."""
+        return self.phases[1].q[-1]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Failure:
+    """Why there is no way; as a string, a sentence.
+
+    Attributes:
+        status: What kind of reason it is.
+        step: That was looked at; None where it is not about a single one.
+        detail: More than `status` says, where there is more.
+    """
+
+    status: Status
+    step: Step | None = None
+    detail: str = ""
+
+    __repr__ = short_repr
+
+    def __str__(self) -> str:
+        """The step and the reason."""
+        why = self.detail or self.status.value
+        return why if self.step is None else f"{self.step}: {why}"
 
 
 def standing(
@@ -104,41 +164,68 @@ def home_at(world: World, at: np.ndarray) -> np.ndarray:
     return q
 
 
-def plan_step(
+def change_contact(
     ik: IK,
     before: Keyframe,
     step: Step,
-    method: str,
     options: KeyframeOptions,
-    lap: Callable[[str], None],
-) -> tuple[Keyframe, Path] | str:
-    """The next keyframe and the path to it, or why there is none."""
+    method: Method = "direct",
+) -> Change | Failure:
+    """Change one contact: the next keyframe and the way to it, or why there is none.
+
+    What is tried, until something works: on the contacts that stay as they are, then,
+    where a contact is made, with their feet on tiptoe, which reach farther; each with
+    the new contact where the optimisation puts it and where the unloaded robot reaches
+    it (the other way round where its place is prescribed); each with every one of
+    `MARGINS`.
+
+    Args:
+        ik: Workspace.
+        before: The keyframe to begin from.
+        step: What to change.
+        options: Of the posture optimisation.
+        method: By which it places the new contact.
+
+    Returns:
+        Where there is no way, what the last attempt without tiptoe failed at.
+    """
+    failure = None
+    for held in _footings(ik, before, step):
+        found = None
+        for key in _keyframes(ik, before, step, held, options, method):
+            found = _change(ik, before, key, step)
+            if isinstance(found, Change):
+                return found
+        failure = failure or found
+    if failure is None:
+        why = "nothing else bears load"
+        return Failure(status=Status.UNBALANCED, step=step, detail=why)
+    return failure
+
+
+def _footings(ik: IK, before: Keyframe, step: Step) -> Iterator[tuple[Contact, ...]]:
+    """What a step may stand on: the contacts that stay, then their feet on tiptoe."""
     held = tuple(c for c in before.stance if c.surface not in step.breaks)
     if not held:
-        return f"{step}: nothing else bears load"
-    result = _plan_on(ik, before, step, held, method, options, lap)
-    if isinstance(result, str) and step.makes:
-        # On tiptoe, feet that stay reach farther.
+        return
+    yield held
+    if step.makes is not None:
         tiptoe = tuple(rolled(ik, before.q, c, step.makes.position) for c in held)
         if any(a is not b for a, b in zip(held, tiptoe, strict=True)):
-            other = _plan_on(ik, before, step, tiptoe, method, options, lap)
-            if not isinstance(other, str):
-                return other
-    return result
+            yield tiptoe
 
 
-def _plan_on(
+def _keyframes(
     ik: IK,
     before: Keyframe,
     step: Step,
     held: tuple[Contact, ...],
-    method: str,
     options: KeyframeOptions,
-    lap: Callable[[str], None],
-) -> tuple[Keyframe, Path] | str:
-    """The next keyframe and the path to it on the contacts `held`, or why not."""
-    world = ik.world
-    new = (step.makes,) if step.makes else ()
+    method: Method,
+) -> Iterator[Keyframe]:
+    """Postures in which the contact is changed, on the contacts `held`."""
+    wanted = step.makes
+    new = () if wanted is None else (wanted,)
     task = KeyframeTask(
         held=held,
         new=new,
@@ -148,47 +235,44 @@ def _plan_on(
     )
     begin = before.q
     if step.stands_up:
-        begin = _home_over(world, (*held, *new))
+        begin = _home_over(ik.world, (*held, *new))
         task = replace(task, q_reference=begin, directions={})
-    wanted, result = step.makes, "nothing tried"
     for there in (True, False) if step.fixed else (False, True):
-        if wanted is not None and there:
+        if there and wanted is not None:
             # Put the contact where the unloaded robot reaches it.
-            key = _keyframe_there(ik, task, wanted, step, before.q, method, options)
-        else:
-            key = METHODS[method](ik, task, begin, options)
-            if step.makes is not None:
-                wanted = next(c for c in key.stance if c.surface == step.makes.surface)
-        lap("keyframes")
-        result = _best_margin(ik, before, key, step, lap)
-        if not isinstance(result, str):
-            return key, result
-        if step.makes is None:
-            break
-    return result
+            key = _keyframe_there(ik, task, wanted, step, before.q, options)
+            yield replace(key, method=method)
+            continue
+        key = METHODS[method](ik, task, begin, options)
+        yield key
+        if wanted is None:
+            return
+        wanted = next(c for c in key.stance if c.surface == wanted.surface)
 
 
-def _best_margin(
-    ik: IK, before: Keyframe, key: Keyframe, step: Step, lap: Callable[[str], None]
-) -> Path | str:
-    """The path with the largest of `MARGINS` for which there is one, or why not."""
-    if key.status is Status.OVERLOADED:
-        return f"{step}: {limiting_joint(ik.kin, key.q, key.stance)}"
+def _change(ik: IK, before: Keyframe, key: Keyframe, step: Step) -> Change | Failure:
+    """The way to a keyframe with the largest of `MARGINS` for which there is one."""
     if key.status is not Status.SOLVED:
-        return f"{step}: {key.status.value}"
-    reason = ""
+        detail = ""
+        if key.status is Status.OVERLOADED:
+            detail = limiting_joint(ik.kin, key.q, key.stance)
+        return Failure(status=key.status, step=step, detail=detail)
+    status, detail = key.status, ""
     for margin in MARGINS:
         transition = plan_transition(ik, before, key, step, margin=margin)
-        lap("transitions")
-        if transition.status is not Status.SOLVED:
-            reason = f"{step}: {transition.note or transition.status.value}"
+        status, detail = transition.status, transition.note
+        if status is not Status.SOLVED:
             continue
         path = plan_path(ik, transition)
-        lap("paths")
-        if path.status is Status.SOLVED:
-            return path
-        reason = f"{step}: {path.note or path.status.value}"
-    return reason
+        status, detail = path.status, path.note
+        if status is Status.SOLVED:
+            return Change(
+                step=transition.step,
+                keyframe=key,
+                phases=path.phases,
+                margin=margin,
+            )
+    return Failure(status=status, step=step, detail=detail)
 
 
 def _keyframe_there(
@@ -197,11 +281,9 @@ def _keyframe_there(
     wanted: Contact,
     step: Step,
     q: np.ndarray,
-    method: str,
     options: KeyframeOptions,
 ) -> Keyframe:
     """A stable posture with the new contact at, or nearest to, a given place."""
     contact, solution = approach_contact(ik, task.held, wanted, q, step.seeds.touching)
     fixed = replace(task, new=(contact,), fixed=True)
-    key = direct.optimise(ik, fixed, solution.q, options)
-    return replace(key, method=method)
+    return direct.optimise(ik, fixed, solution.q, options)

@@ -134,37 +134,65 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
             taken as it is, for comparison.
     """
     t = transition
-    made = t.held
-    if t.step.makes:
-        made = (*t.held, t.step.makes)
-    closed = (*t.held, *t.rolling)
     swing, control = _swing(ik, t, adapt)
-    phases = (
+    closed, loaded = (*t.held, *t.rolling), t.stance
+    made = t.held if t.step.makes is None else (*t.held, t.step.makes)
+    postures = (
+        bridge(ik, t.before, t.shifted, closed, loaded),
+        swing,
+        bridge(ik, t.touching, t.after, made, made),
+    )
+    phases = contact_phases(
+        t.stance, t.held, t.rolling, t.step.makes, postures, control
+    )
+    status, note = check_phases(ik, phases, t)
+    return Path(transition=t, phases=phases, status=status, note=note)
+
+
+def contact_phases(
+    stance: tuple[Contact, ...],
+    held: tuple[Contact, ...],
+    rolling: tuple[Contact, ...],
+    made: Contact | None,
+    postures: Sequence[np.ndarray],
+    arc: np.ndarray,
+) -> tuple[Phase, Phase, Phase]:
+    """The phases that change one contact: shift, swing and settle.
+
+    Args:
+        stance: Contacts before it.
+        held: Those that stay; a foot that goes on tiptoe is on its edge here.
+        rolling: Those that are broken, as they are let go.
+        made: The new contact, if any.
+        postures: (n, nq) of each phase.
+        arc: (m, 3) control points of the swing.
+    """
+    after = held if made is None else (*held, made)
+    shift, swing, settle = postures
+    return (
         Phase(
             kind="shift",
-            q=bridge(ik, t.before, t.shifted, closed, t.stance),
-            contacts=closed,
-            load_before=t.stance,
-            load_after=t.held,
+            q=shift,
+            contacts=(*held, *rolling),
+            load_before=stance,
+            load_after=held,
         ),
         Phase(
             kind="swing",
             q=swing,
-            contacts=t.held,
-            load_before=t.held,
-            load_after=t.held,
-            arc=control,
+            contacts=held,
+            load_before=held,
+            load_after=held,
+            arc=arc,
         ),
         Phase(
             kind="settle",
-            q=bridge(ik, t.touching, t.after, made, made),
-            contacts=made,
-            load_before=t.held,
-            load_after=made,
+            q=settle,
+            contacts=after,
+            load_before=held,
+            load_after=after,
         ),
     )
-    status, note = check_phases(ik, phases, t)
-    return Path(transition=t, phases=phases, status=status, note=note)
 
 
 def interpolate(kin: Kinematics, a: np.ndarray, b: np.ndarray, s: float) -> np.ndarray:

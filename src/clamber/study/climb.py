@@ -164,9 +164,7 @@ def run_climb(climb: Climb) -> ClimbResult:
         # One process does many climbs that differ in their disturbances alone.
         made = _planned(replace(climb, controller="mixed", disturb=Disturbance()))
         if not made.complete or made.trajectory is None:
-            missed = [s.reason for s in made.skipped if s.missed]
-            reasons = missed or [s.reason for s in made.skipped] or ["no move in it"]
-            return ClimbResult(reached=False, why=f"no plan: {reasons[0]}")
+            return ClimbResult(reached=False, why=f"no plan: {made.why_not}")
         rollout = simulate(made, controller=climb.controller, disturbance=climb.disturb)
     except InputError as e:
         return ClimbResult(reached=False, why=f"no plan: {e}")
