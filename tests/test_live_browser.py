@@ -11,7 +11,7 @@ import io
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ import pytest
 from PIL import Image
 
 import clamber
+from clamber.execution.simulation import Rollout
+from clamber.planning.records import Plan
 from clamber.show.live import LAYERS, open_view
 from clamber.show.renderer import PRESETS
 
@@ -108,8 +110,25 @@ def served(browser: Any, source: Any, query: str = "", **options: Any):
 
 
 @pytest.fixture(scope="module")
-def shared_view(browser: Any, whole: Path) -> Iterator[Opened]:
-    with served(browser, whole) as opened:
+def off_plan(
+    one_hand_plan: Plan,
+    one_hand_rollout: Rollout,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    """The run, to the left of where it was planned."""
+    folder = tmp_path_factory.mktemp("off_plan")
+    qpos = one_hand_rollout.qpos + 0.08 * (
+        np.arange(one_hand_rollout.qpos.shape[1]) == 1
+    )
+    clamber.save_plan(one_hand_plan, folder)
+    rollout = replace(one_hand_rollout, qpos=qpos)
+    clamber.save_rollout(one_hand_plan, rollout, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shared_view(browser: Any, off_plan: Path) -> Iterator[Opened]:
+    with served(browser, off_plan) as opened:
         opened.until(lambda: opened.orange() > ENOUGH, "the robot")
         opened.tab.get_by_text("Show", exact=True).click()
         yield opened
