@@ -80,7 +80,7 @@ _HOME = {
     "plan": "planning.planner",
     "plan_cost": "planning.substitutes",
     "plan_or_replan": "planning.substitutes",
-    "plan_traverse": "planning.gait",
+    "plan_traverse": "planning.traverse",
     "propose_robot": "model.propose",
     "render_run": "show.pictures",
     "replan": "planning.substitutes",

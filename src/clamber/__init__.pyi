@@ -35,7 +35,6 @@ from clamber.planning.diagnose import Checkup as Checkup
 from clamber.planning.diagnose import check_robot as check_robot
 from clamber.planning.diagnose import check_scene as check_scene
 from clamber.planning.free import Bounds as Bounds
-from clamber.planning.gait import plan_traverse as plan_traverse
 from clamber.planning.planner import plan as plan
 from clamber.planning.records import Fallback as Fallback
 from clamber.planning.records import Plan as Plan
@@ -52,6 +51,7 @@ from clamber.planning.substitutes import replan as replan
 from clamber.planning.substitutes import replan_rest as replan_rest
 from clamber.planning.substitutes import state_of as state_of
 from clamber.planning.trajectory import Trajectory as Trajectory
+from clamber.planning.traverse import plan_traverse as plan_traverse
 from clamber.recording.demonstration import Demonstration as Demonstration
 from clamber.recording.detect import detect_contacts as detect_contacts
 from clamber.recording.recording import load_demo as load_demo

@@ -21,7 +21,6 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World, build_world, limb_links
-from clamber.planning.gait import follow_policy
 from clamber.planning.planner import search_steps, timed
 from clamber.planning.records import Plan, PlanOptions, State
 from clamber.planning.trajectory import (
@@ -31,6 +30,7 @@ from clamber.planning.trajectory import (
     Trajectory,
     build_trajectory,
 )
+from clamber.planning.traverse import follow_policy
 from clamber.step import direct
 from clamber.step.change import Failure, standing
 from clamber.step.ik import IK, NO_WARINESS, ContactGoal, Wary, support_rotation

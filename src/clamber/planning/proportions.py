@@ -7,120 +7,150 @@ another size goes the same way.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from clamber.contact.policy import GeneralPolicy
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import Limb
 from clamber.model.se3 import turn_about_z
-from clamber.planning.stairs import Gait
-from clamber.step.ik import IK
 
 STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
-# Where the body stands before an edge, in lengths of its legs.
+# Where the body stands before an edge, in lengths of its legs: nearer, knees meet the
+# edge; farther, the weight does not get over the hands.
 STAND = 0.54
 REACH = 0.65  # lengths of an arm that hands reach beyond a stand
-# Contacts while climbing, from the edge inwards: in steps of the limb.
+# Contacts while climbing, from the edge inwards: in steps of the limb. Knees nearer to
+# the edge slip off it, hands and elbows farther from it do not bear the trunk.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
+# Contacts on all fours, ahead of the body's middle or behind it in lengths of the
+# trunk, and to its side in half distances between shoulders or hips: narrower, and the
+# robot tips over; longer, and neither arms nor legs can let go.
+AHEAD, BESIDE_ARMS, BESIDE_LEGS = 0.35, 1.1, 1.35
 STRETCH = 0.57  # lengths of the trunk from the body's middle to hands or knees
+# While climbing, to the side in what it is on all fours: hands together bear the trunk
+# before the elbows come, outside of them.
+HANDS_BESIDE, KNEES_BESIDE = 0.36, 0.9
+BEHIND = 0.8  # lengths of a body on all fours from an edge before it climbs down
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Build:
-    """What a robot's build says of its steps.
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class StairSteps:
+    """Where limbs go on stairs.
+
+    Attributes:
+        lead: Hands are set down so far ahead of the feet [m].
+        gap: Feet come no nearer to the hands than this [m].
+        knee: Knees come so far behind the last edge, at least [m].
+        span: From knees to hands at the end [m].
+        sides: Of each surface, to the left of the way [m].
+    """
+
+    lead: float
+    gap: float
+    knee: float
+    span: float
+    sides: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Proportions:
+    """What a robot's lengths say of its steps.
 
     Attributes:
         step: Of each limb (5.9) [m].
-        fours: (2,) offset of each limb's contact from the body's frame, on all fours.
-        feet: Half the distance between the feet.
-        ahead: (2,) from the ankles' midpoint to the feet's, in the body's frame.
+        offsets: (2,) of each limb's contact from the body's frame, on all fours [m].
+        feet: Half the distance between the feet [m].
+        ahead: (2,) from the ankles' midpoint to the feet's, in the body's frame [m].
         stand: From the feet to an edge that is to be climbed [m].
+        behind: From an edge to the body's middle before it climbs down [m].
         reach: From the feet to an edge, at most [m].
-        tall: Height that hands reach, standing [m].
+        height: That hands reach, standing [m].
         thigh: [m]
         stretch: Half of what it is stretched by on hands and knees [m].
-        round: Radius of what the body takes up while it turns on all fours [m].
-        gait: On stairs.
+        radius: Of what the body takes up while it turns on all fours [m].
+        stairs: On stairs.
     """
 
-    step: dict[str, float]
-    fours: dict[str, np.ndarray]
+    step: Mapping[str, float]
+    offsets: Mapping[str, np.ndarray]
     feet: float
     ahead: np.ndarray
     stand: float
+    behind: float
     reach: float
-    tall: float
+    height: float
     thigh: float
     stretch: float
-    round: float
-    gait: Gait
+    radius: float
+    stairs: StairSteps
+
+    def mount(self, limb: Limb, surface: str) -> np.ndarray:
+        """(2,) from an edge inwards, and to the left, where a climb sets a surface."""
+        outer = surface == limb.surfaces[0]
+        side = self.offsets[limb.name][1]
+        if not limb.is_arm:
+            kind, side = "knee", KNEES_BESIDE * side
+        else:
+            kind, side = ("hand", HANDS_BESIDE * side) if outer else ("elbow", side)
+        return np.array([DEPTH[kind] * self.step[limb.name], side])
 
 
-def build_of(ik: IK, policy: GeneralPolicy) -> Build:
+def proportions_of(kin: Kinematics, policy: GeneralPolicy) -> Proportions:
     """The robot's lengths as it stands, and steps as long as the policy shows."""
-    world, kin = ik.world, ik.kin
+    world = kin.world
     kin.update(world.home)
     along = turn_about_z(world.scene.start[2])
     limbs = world.robot.limbs.values()
-    root = {x.name: along.T @ kin.landmark(x.root)[1][:2] for x in limbs}
     arms = [x for x in limbs if x.is_arm]
     legs = [x for x in limbs if not x.is_arm]
-    length = {
-        x.name: sum(
-            float(np.linalg.norm(kin.landmark(a)[1] - kin.landmark(b)[1]))
-            for a, b in ((x.root, x.middle), (x.middle, x.end))
-        )
-        for x in limbs
-    }
-    trunk = float(
-        np.linalg.norm(kin.landmark(arms[0].root)[1] - kin.landmark(legs[0].root)[1])
-    )
-    step = {}
+
+    def apart(a: str, b: str) -> float:
+        return float(np.linalg.norm(kin.landmark(a)[1] - kin.landmark(b)[1]))
+
+    def half_width(pair: list[Limb]) -> float:
+        left, right = (along.T @ kin.landmark(x.root)[1][:2] for x in pair)
+        return 0.5 * abs(float(left[1] - right[1]))
+
+    trunk = apart(arms[0].root, legs[0].root)
+    side = {True: BESIDE_ARMS * half_width(arms), False: BESIDE_LEGS * half_width(legs)}
+    length, step, offsets = {}, {}, {}
     for x in limbs:
+        length[x.name] = apart(x.root, x.middle) + apart(x.middle, x.end)
         shown = [policy.reach[s] for s in x.surfaces if s in policy.reach]
         step[x.name] = min(1.0 / STEPS, max(shown, default=1.0)) * length[x.name]
-    half = {
-        kind: 0.5 * abs(float(root[a.name][1] - root[b.name][1]))
-        for kind, (a, b) in (("arm", arms), ("leg", legs))
-    }
-    fours = {}
-    for x in limbs:
-        sign = 1.0 if x.name.startswith("left") else -1.0
-        side = 1.1 * half["arm"] if x.is_arm else 1.35 * half["leg"]
-        ahead = 0.35 * trunk if x.is_arm else -0.35 * trunk
-        fours[x.name] = np.array([ahead, sign * side])
+        ahead = AHEAD * trunk if x.is_arm else -AHEAD * trunk
+        left = 1.0 if x.name.startswith("left") else -1.0
+        offsets[x.name] = np.array([ahead, left * side[x.is_arm]])
+    leg, arm = length[legs[0].name], length[arms[0].name]
+    thigh = apart(legs[0].root, legs[0].middle)
     up = np.array([0.0, 0.0, 1.0])
     soles = [kin.contact_point(x.surfaces[0], up)[:2] for x in legs]
-    leg, arm = length[legs[0].name], length[arms[0].name]
-    thigh = float(
-        np.linalg.norm(kin.landmark(legs[0].root)[1] - kin.landmark(legs[0].middle)[1])
-    )
     feet = 0.5 * float(np.linalg.norm(soles[0] - soles[1]))
-    ahead = along.T @ (np.mean(soles, axis=0) - world.scene.start[:2])
+    sides = {s: float(offsets[x.name][1]) for x in limbs for s in x.surfaces}
+    sides |= {x.surfaces[0]: math.copysign(feet, sides[x.surfaces[0]]) for x in legs}
     stand, arm_step = STAND * leg, min(step[x.name] for x in arms)
-    sides = {}
-    for x in limbs:
-        y = fours[x.name][1]
-        sides |= dict.fromkeys(x.surfaces, float(y))
-        if not x.is_arm:
-            sides[x.surfaces[0]] = math.copysign(feet, y)
-    return Build(
+    rear = max(-o[0] for o in offsets.values())
+    return Proportions(
         step=step,
-        fours=fours,
+        offsets=offsets,
         feet=feet,
-        ahead=ahead,
+        ahead=along.T @ (np.mean(soles, axis=0) - world.scene.start[:2]),
         stand=stand,
+        behind=BEHIND * (rear + DEPTH["knee"] * min(step.values())),
         reach=stand + REACH * arm,
-        tall=leg + trunk + arm,
+        height=leg + trunk + arm,
         thigh=thigh,
         stretch=STRETCH * trunk,
         # The shanks trail behind the knees.
-        round=max(float(np.linalg.norm(x)) for x in fours.values()) + leg - thigh,
-        gait=Gait(
+        radius=max(float(np.linalg.norm(o)) for o in offsets.values()) + leg - thigh,
+        stairs=StairSteps(
             lead=stand + DEPTH["hand"] * arm_step,
             gap=arm_step,
             knee=DEPTH["knee"] * min(step[x.name] for x in legs),
-            span=float(fours[arms[0].name][0] - fours[legs[0].name][0]),
+            span=float(offsets[arms[0].name][0] - offsets[legs[0].name][0]),
             sides=sides,
         ),
     )

@@ -13,18 +13,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clamber.contact.contact import Contact
 from clamber.contact.policy import Edge
 from clamber.errors import InputError
 from clamber.model.scene import GROUND_HALF_SIZE, Scene, Support
+from clamber.model.se3 import quat_from_matrix, turn_about_z
 
 GAP = 0.40  # [m] a narrower gap is crossed on top, a wider one on the ground
 JOINT = 0.02  # [m] a narrower gap is none
-BESIDE = (
-    0.25  # [m] a gate keeps so far from the ends of its edge, where it is that long
-)
-BORDER = 0.02  # [m] contacts stay so far inside a top's border
-GRID = 0.02  # [m] of the search for a place
-SPAN = 0.24  # [m] a place is looked for this far around where it is wanted
+# [m] An edge is climbed so far from its ends, where it is that long: nearer to them, a
+# hand or a knee finds no place on its side.
+BESIDE = 0.25
+ARRIVED = 0.05  # [m] from where it shall get to, the body is there
+FACING = 0.15  # [rad] from how it shall face
+BORDER = 0.02  # [m] contacts stay so far inside a top's border: less, and they slip off
+GRID = 0.02  # [m] of the search for a place: coarser, and it misses narrow ones
+# [m] A place is looked for this far around where it is wanted: less than half of `GAP`,
+# and there is none over the middle of a gap.
+SPAN = 0.24
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -48,13 +54,52 @@ class Platform:
         """The edge that is climbed up, and that which is climbed down, if any."""
         return (self.entry,) if self.exit is None else (self.entry, self.exit)
 
+    def is_passed(self, xy: np.ndarray) -> bool:
+        """Whether a point (2,) is behind its far edge."""
+        edge = self.exit
+        return edge is not None and edge.distance(xy) < 0 < self.entry.distance(xy)
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Place:
-    """A point (3,) on a support where a contact can be made."""
 
-    support: str
-    position: np.ndarray
+@dataclass(frozen=True, eq=False, slots=True)
+class Frame:
+    """Where the body is over its contacts: x, y [m] and yaw [rad]."""
+
+    xy: np.ndarray
+    yaw: float
+
+    def at(self, offset: np.ndarray) -> np.ndarray:
+        """(2,) in the world of a point of the frame."""
+        return self.xy + turn_about_z(self.yaw) @ offset
+
+    def local(self, p: np.ndarray) -> np.ndarray:
+        """(2,) in the frame of a point of the world."""
+        return turn_about_z(self.yaw).T @ (p[:2] - self.xy)
+
+    def away(self, other: Frame) -> float:
+        """Distance [m]."""
+        return float(np.linalg.norm(self.xy - other.xy))
+
+    def turn_to(self, other: Frame) -> float:
+        """Angle to how the other one faces, the short way [rad]."""
+        return math.remainder(other.yaw - self.yaw, 2.0 * math.pi)
+
+    def is_at(self, other: Frame) -> bool:
+        """Near enough to have arrived."""
+        return self.away(other) <= ARRIVED and abs(self.turn_to(other)) <= FACING
+
+    def part_way(self, other: Frame, share: float) -> Frame:
+        """A part of the way to another one."""
+        xy = self.xy + share * (other.xy - self.xy)
+        return Frame(xy, self.yaw + share * (other.yaw - self.yaw))
+
+    def towards(self, other: Frame, step: float, turn: float) -> Frame:
+        """After one cycle: the way comes first, the turn as late as it can be."""
+        way, angle = other.xy - self.xy, self.turn_to(other)
+        away = float(np.linalg.norm(way)) / step
+        turns = abs(angle) / turn
+        cycles = max(away, turns, 1.0)
+        share = angle / cycles if away <= turns + 1.0 or turns == 0 else 0.0
+        return Frame(self.xy + way / cycles, self.yaw + share)
 
 
 def goal_of(scene: Scene) -> np.ndarray:
@@ -81,13 +126,9 @@ def goal_of(scene: Scene) -> np.ndarray:
 def find_platforms(scene: Scene, goal: np.ndarray) -> tuple[Platform, ...]:
     """The platforms between the scene's start and `goal` (2,), in order."""
     start = scene.start[:2]
-    met = []
-    for box in scene.boxes:
-        crossed = crossing(box.top, start, goal)
-        if crossed is not None:
-            met.append((*crossed, box.top))
-    met.sort(key=lambda m: m[0])
     length = float(np.linalg.norm(goal - start))
+    crossed = [(crossing(b.top, start, goal), b.top) for b in scene.boxes]
+    met = sorted(((*c, top) for c, top in crossed if c), key=lambda m: m[0])
     groups: list[list[tuple[float, float, Support]]] = []
     end = -math.inf
     for t0, t1, top in met:
@@ -98,29 +139,26 @@ def find_platforms(scene: Scene, goal: np.ndarray) -> tuple[Platform, ...]:
         end = max(end, t1)
     out = []
     for group in groups:
-        last = max(group, key=lambda m: m[1])
-        up = _edge(group[0][2], start, goal, group[0][0])
-        down = None
-        if last[1] < 1.0:
-            down = _edge(last[2], goal, start, 1.0 - last[1])
-        boxes = tuple(top.name for _, _, top in group)
-        shares, end = [], group[0][1]
+        gaps, end = [], group[0][1]
         for t0, t1, _ in group[1:]:
             if (t0 - end) * length > JOINT:
-                shares.append((end, t0))
+                gaps.append(start + np.outer((end, t0), goal - start))
             end = max(end, t1)
-        gaps = tuple(start + np.outer(x, goal - start) for x in shares)
-        out.append(Platform(boxes=boxes, entry=up, exit=down, gaps=gaps))
+        _, end, last = max(group, key=lambda m: m[1])
+        out.append(
+            Platform(
+                boxes=tuple(top.name for _, _, top in group),
+                entry=_gate(group[0][2], start, goal, group[0][0]),
+                exit=_gate(last, goal, start, 1.0 - end) if end < 1.0 else None,
+                gaps=tuple(gaps),
+            )
+        )
     return tuple(out)
 
 
-def _corners(top: Support) -> np.ndarray:
-    """(K, 2) of a support in the world, counter-clockwise."""
-    return (top.position + top.polygon @ top.rotation[:, :2].T)[:, :2]
-
-
-def _sides(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Half-planes `A p <= b` of a polygon (K, 2), side i from corner i to the next."""
+def _sides(top: Support) -> tuple[np.ndarray, np.ndarray]:
+    """Half-planes `A p <= b` of a top seen from above, side i from corner i on."""
+    corners = top.vertices[:, :2]
     along = np.roll(corners, -1, axis=0) - corners
     A = np.stack([along[:, 1], -along[:, 0]], axis=1)
     A /= np.linalg.norm(A, axis=1, keepdims=True)
@@ -131,7 +169,7 @@ def crossing(
     top: Support, start: np.ndarray, goal: np.ndarray
 ) -> tuple[float, float] | None:
     """Shares of the way at which it enters and leaves a top; None: it misses it."""
-    A, b = _sides(_corners(top))
+    A, b = _sides(top)
     rate, room = A @ (goal - start), b - A @ start
     t0, t1 = 0.0, math.inf
     for r, x in zip(rate, room, strict=True):
@@ -145,10 +183,9 @@ def crossing(
     return (float(t0), float(t1)) if t0 < min(t1, 1.0) else None
 
 
-def _edge(top: Support, start: np.ndarray, goal: np.ndarray, share: float) -> Edge:
-    """The side through which the line from start to goal enters at that share."""
-    corners = _corners(top)
-    A, b = _sides(corners)
+def _gate(top: Support, start: np.ndarray, goal: np.ndarray, share: float) -> Edge:
+    """Where the line from start to goal enters a top at that share, off its corners."""
+    corners, (A, b) = top.vertices[:, :2], _sides(top)
     p = start + share * (goal - start)
     facing = A @ (goal - start) < 0
     i = int(np.argmin(np.where(facing, np.abs(A @ p - b), np.inf)))
@@ -160,9 +197,21 @@ def _edge(top: Support, start: np.ndarray, goal: np.ndarray, share: float) -> Ed
     return Edge(point=first + s * along, inward=-A[i])
 
 
+def contact_at(surface: str, top: Support, point: np.ndarray, yaw: float) -> Contact:
+    """A surface on a support, over or under a point (3,), turned about the vertical."""
+    R = np.eye(3)
+    R[:2, :2] = turn_about_z(yaw)
+    return Contact(
+        surface=surface,
+        support=top.name,
+        position=top.project(point),
+        quaternion=quat_from_matrix(R),
+    )
+
+
 def find_place(
     scene: Scene, boxes: tuple[str, ...], wanted: np.ndarray, beside: float
-) -> Place | None:
+) -> tuple[str, np.ndarray] | None:
     """The place nearest to `wanted` (2,) on the tops of some boxes; None: nowhere.
 
     Args:
@@ -170,50 +219,42 @@ def find_place(
         boxes: On whose tops.
         wanted: x, y in the world [m].
         beside: Distance from whatever is higher than the top [m].
+
+    Returns:
+        The box, and where (3,) on its top.
     """
     steps = np.arange(-SPAN, SPAN + GRID / 2, GRID)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     order = np.argsort(np.linalg.norm(grid, axis=1), kind="stable")
     points = wanted + grid[order]
-    supports = {s.name: s for s in scene.supports}
-    names = [b.name for b in scene.boxes]
-    sides = [_sides(_corners(supports[n])) for n in names]
-    gap = np.array([(points @ A.T - b).max(axis=1) for A, b in sides])
-    height = np.array([_height(supports[n], points) for n in names])
+    tops = [box.top for box in scene.boxes]
+    gap = np.array([(points @ A.T - b).max(axis=1) for A, b in map(_sides, tops)])
+    height = np.array([top.level(points) for top in tops])
     best = None
-    for i, name in enumerate(names):
-        if name not in boxes:
+    for i, top in enumerate(tops):
+        if top.name not in boxes:
             continue
         good = gap[i] <= -BORDER
-        for k in range(len(names)):
+        for k in range(len(tops)):
             if k != i:
                 good &= (gap[k] > beside) | (height[k] <= height[i] + 1e-6)
         found = np.flatnonzero(good)
         if len(found) and (best is None or found[0] < best[0]):
-            best = (int(found[0]), name, float(height[i][found[0]]))
+            best = (int(found[0]), top.name, float(height[i][found[0]]))
     if best is None:
         return None
     k, name, z = best
-    return Place(support=name, position=np.array([*points[k], z]))
+    return name, np.array([*points[k], z])
 
 
 def room_on(scene: Scene, boxes: tuple[str, ...], xy: np.ndarray) -> float:
     """From a point (2,) on some boxes to the nearest other one; inf: there is none."""
     room = math.inf
-    for box in scene.boxes:
-        if box.name not in boxes:
-            corners = _corners(box.top)
-            A, b = _sides(corners)
-            if (A @ xy - b).max() <= 0.0:
-                return 0.0
-            for p, q in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-                share = np.clip((xy - p) @ (q - p) / ((q - p) @ (q - p)), 0.0, 1.0)
-                room = min(room, float(np.linalg.norm(p + share * (q - p) - xy)))
+    for top in (b.top for b in scene.boxes if b.name not in boxes):
+        corners, (A, b) = top.vertices[:, :2], _sides(top)
+        if (A @ xy - b).max() <= 0.0:
+            return 0.0
+        for p, q in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            share = np.clip((xy - p) @ (q - p) / ((q - p) @ (q - p)), 0.0, 1.0)
+            room = min(room, float(np.linalg.norm(p + share * (q - p) - xy)))
     return room
-
-
-def _height(top: Support, points: np.ndarray) -> np.ndarray:
-    """(n,) of a support's plane over points (n, 2) [m]."""
-    n = top.normal
-    off = points - top.position[:2]
-    return top.position[2] - off @ n[:2] / n[2]
