@@ -183,7 +183,7 @@ def read_yaml_block(block: Block, folder: Path) -> None:
     from clamber.model.robot import RobotFile
     from clamber.model.terrain import SceneFile
     from clamber.recording.recording import RecordingFile
-    from clamber.run.folder import _StateOnDisk
+    from clamber.run.state import StateFile
     from clamber.study.spec import Spec, next_runs, strands
 
     fields = yaml.safe_load(block.text)
@@ -192,7 +192,7 @@ def read_yaml_block(block: Block, folder: Path) -> None:
     if names & {"limbs", "surfaces"}:
         RobotFile.model_validate(fields)
     elif "joints" in names:
-        _StateOnDisk.model_validate(fields)
+        StateFile.model_validate(fields)
     elif "file" in names:
         RecordingFile.model_validate(fields)
     elif names & {"boxes", "ground"}:

@@ -14,7 +14,7 @@ from clamber.errors import InputError
 from clamber.model.scene import GROUND, Box, Scene, Support
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.terrain import load_scene
-from clamber.run.folder import scene_fields
+from clamber.run.forms import CODEC
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -351,7 +351,7 @@ def test_a_box_is_smooth_unless_its_file_says_how_rough_it_is(tmp_path):
 def test_roughness_survives_the_fields_of_a_written_scene(tmp_path):
     box = box_at((0.0, 0.0, 0.3))
     scene = Scene(boxes=(replace(box, roughness=0.017),), start=np.zeros(3))
-    fields = scene_fields(scene)
+    fields = CODEC.encode(scene)
     assert [b["roughness"] for b in fields["boxes"]] == [0.017]
     plain = yaml.safe_dump(json.loads(json.dumps(fields, default=np.ndarray.tolist)))
     again = load_scene(written(tmp_path, plain))

@@ -12,7 +12,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from clamber.run.folder import whole_file
+from clamber.run.codec import whole_file
 from clamber.study.curves import Summary, draw_success, summarise
 from clamber.study.spec import strands
 from clamber.study.sweep import load_sweep

@@ -389,7 +389,7 @@ class ReplanCommand:
         return REACHED if found.best.stable else MISSED
 
     def _rest(self, begin: str) -> int:
-        from clamber.run.folder import load_state
+        from clamber.run.state import load_state
 
         made = clamber.load_plan(self.source)
         if self.world.scene is None and self.world.height is None:
@@ -786,7 +786,7 @@ class ExportCommand:
     lead_in: Annotated[str | None, tyro.conf.arg(metavar="FILE|home")] = None
     """Measured joint angles [rad] by name (YAML or JSON), to start from."""
     lead_in_speed: Annotated[float, tyro.conf.arg(metavar="RAD/S")] = field(
-        default_factory=lambda: import_module("clamber.run.export").LEAD_IN_SPEED
+        default_factory=lambda: import_module("clamber.run.lead_in").SPEED
     )
     """Largest joint speed on the way from there to the first posture."""
     layout: Annotated[

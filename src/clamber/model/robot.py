@@ -151,6 +151,18 @@ def load_robot(name_or_path: str | Path) -> Robot:
     model_path = path.parent / file.model
     if not model_path.is_file():
         raise InputError("an MJCF or URDF file", path, "model", file.model)
+    robot = robot_of(file, path.parent)
+    _check(robot, path)
+    return robot
+
+
+def robot_of(file: RobotFile, folder: Path) -> Robot:
+    """The robot of a file whose model is below a folder, or elsewhere by a whole path.
+
+    Args:
+        file: With all four limbs.
+        folder: Of the model.
+    """
     limbs = {
         n: Limb(
             name=n, root=f.root, middle=f.middle, end=f.end, surfaces=tuple(f.surfaces)
@@ -159,9 +171,9 @@ def load_robot(name_or_path: str | Path) -> Robot:
         for f in (file.limbs[n],)
     }
     gains = {"default": GainsFile(), **file.gains}
-    robot = Robot(
+    return Robot(
         name=file.name,
-        path=model_path,
+        path=folder / file.model,
         base=file.base,
         home=dict(file.home),
         limbs=limbs,
@@ -173,8 +185,6 @@ def load_robot(name_or_path: str | Path) -> Robot:
         impedance={n: (g.kp, g.kd) for n, g in file.impedance.items()},
         self_positioning=tuple(file.self_positioning),
     )
-    _check(robot, path)
-    return robot
 
 
 def _check(robot: Robot, source: Path) -> None:

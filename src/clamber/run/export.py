@@ -11,39 +11,29 @@ Shapes: T samples, na joints, nS surfaces, nb bodies of the robot.
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from numbers import Real
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError, MissingDependency, read_yaml
+from clamber.errors import InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
 from clamber.planning.records import Plan
-from clamber.planning.trajectory import RATE, Trajectory, holding_torque
-from clamber.run.folder import (
-    ROLLOUT,
-    load_plan,
-    load_rollout,
-    trajectory_of,
-    whole_file,
-)
+from clamber.planning.trajectory import RATE, Trajectory
+from clamber.run.codec import whole_file
+from clamber.run.folder import ROLLOUT, load_plan, load_rollout, trajectory_of
+from clamber.run.lead_in import SPEED, LeadIn, lead_in_motion, measured_posture
 
 Format = Literal["csv", "mcap", "npz"]
 Layout = Literal["mjlab", "holosoma"]
 # [Hz] of each format: controllers go through positions and velocities by cubic splines,
 # and states of a rollout are recorded at 100; trainers step their policies at 50.
 DEFAULT_RATE: Mapping[str, int] = {"csv": 100, "mcap": 100, "npz": 50}
-LEAD_IN_SPEED = 0.5  # [rad/s] of the fastest joint
-PEAK = 1.875  # largest over mean speed of a minimum-jerk motion
-CHECK_STEP = 0.01  # [rad] of the fastest joint between two looks at distances
-TORQUE_NODES = 11  # postures of a lead-in whose torques are computed
 WORLD = "world"  # the fixed frame of MCAP's messages
 
 
@@ -104,7 +94,7 @@ def export_run(
     out: str | Path | None = None,
     rate: int | None = None,
     lead_in: str | Path | Mapping[str, float] | None = None,
-    lead_in_speed: float = LEAD_IN_SPEED,
+    lead_in_speed: float = SPEED,
     layout: Layout | None = None,
 ) -> Exported:
     """Write the motion of a run for other tools.
@@ -124,20 +114,16 @@ def export_run(
         InputError: There is nothing to export, or an argument cannot be used.
         MissingDependency: `mcap` without its packages.
     """
-    if to not in get_args(Format):
-        raise InputError(
-            f"one of {', '.join(get_args(Format))}", source="--to", value=to
-        )
+    for flag, given, known in (
+        ("--to", to, get_args(Format)),
+        ("--layout", layout, (None, *get_args(Layout))),
+    ):
+        if given not in known:
+            words = ", ".join(filter(None, known))
+            raise InputError(f"one of {words}", source=flag, value=given)
     if layout is not None and to != "npz":
-        raise InputError(
-            "no layout for this format: it goes with --to npz",
-            source="--layout",
-            value=layout,
-        )
-    if layout not in (None, *get_args(Layout)):
-        raise InputError(
-            f"one of {', '.join(get_args(Layout))}", source="--layout", value=layout
-        )
+        text = "no layout for this format: it goes with --to npz"
+        raise InputError(text, source="--layout", value=layout)
     folder = Path(folder)
     file = folder / f"motion.{to}" if out is None else Path(out)
     motion = load_motion(
@@ -155,11 +141,8 @@ def export_run(
             else:
                 _write_npz(motion, draft, layout or "mjlab")
     except OSError as e:
-        raise InputError(
-            f"a file that can be written ({e.strerror or e})",
-            source="--out",
-            value=str(file),
-        ) from e
+        text = f"a file that can be written ({e.strerror or e})"
+        raise InputError(text, source="--out", value=str(file)) from e
     return Exported(
         file=file,
         rate=motion.rate,
@@ -177,7 +160,7 @@ def load_motion(
     *,
     rate: int,
     lead_in: str | Path | Mapping[str, float] | None = None,
-    lead_in_speed: float = LEAD_IN_SPEED,
+    lead_in_speed: float = SPEED,
 ) -> Motion:
     """Read what a run followed, at `rate` [Hz]; the arguments of `export_run`.
 
@@ -188,17 +171,24 @@ def load_motion(
     """
     folder = Path(folder)
     if rate <= 0 or RATE % rate:
-        raise InputError(
-            f"a divisor of {RATE:.0f} Hz, as 50 or 100", source="--rate", value=rate
-        )
+        text = f"a divisor of {RATE:.0f} Hz, as 50 or 100"
+        raise InputError(text, source="--rate", value=rate)
     plan = load_plan(folder)
     reference = trajectory_of(plan, folder)
     rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
     motion = _sampled(plan, reference, rollout, rate)
     if lead_in is None:
         return motion
-    measured = measured_posture(plan.world, lead_in)
-    return _with_lead_in(motion, plan, measured, lead_in_speed)
+    lead = lead_in_motion(
+        plan.world,
+        measured_posture(plan.world, lead_in),
+        motion.q[0],
+        tau=motion.tau[0],
+        stance=plan.keyframes[0].stance,
+        rate=rate,
+        speed=lead_in_speed,
+    )
+    return _after(lead, motion)
 
 
 def _sampled(
@@ -253,153 +243,19 @@ def _with_base_velocity(
     return out
 
 
-# Lead-in.
-
-
-def measured_posture(
-    world: World, given: str | Path | Mapping[str, float]
-) -> np.ndarray:
-    """(na,) joint angles [rad] in the world's order.
-
-    Args:
-        world: Of the robot.
-        given: Angles by joint, a YAML or JSON file of them, or `home`.
-
-    Raises:
-        InputError: A joint is unknown, missing, no number, or beyond its limits.
-    """
-    if isinstance(given, Mapping):
-        source, angles = "lead_in", given
-    elif str(given) == "home":
-        return world.home[world.qadr].copy()
-    else:
-        source, angles = given, read_yaml(Path(given))
-    for name in angles:
-        if name not in world.joints:
-            raise InputError(
-                f"a joint of {world.robot.name}: {', '.join(world.joints)}",
-                source=source,
-                field=str(name),
-            )
-    if missing := [j for j in world.joints if j not in angles]:
-        raise InputError(
-            "an angle of every joint: there is none", source=source, field=missing[0]
-        )
-    out = np.empty(len(world.joints))
-    for i, name in enumerate(world.joints):
-        low, high = (x[world.dadr[i]] for x in (world.q_min, world.q_max))
-        x = angles[name]
-        number = isinstance(x, Real) and not isinstance(x, bool)
-        if not number or not low <= x <= high:  # NaN is not either
-            raise InputError(
-                f"{low:.4g} to {high:.4g} rad, its limits",
-                source=source,
-                field=name,
-                value="nothing" if x is None else x,
-            )
-        out[i] = x
-    return out
-
-
-def _with_lead_in(
-    motion: Motion, plan: Plan, measured: np.ndarray, speed: float
-) -> Motion:
-    """A straight line in joint angles, along it a minimum-jerk profile, before all.
-
-    s(x) = 10 x^3 - 15 x^4 + 6 x^5 over x = t / T, at rest at both ends; its largest
-    speed is 15/8 of the mean [Flash85]. The base stays where it is at the start.
-    """
-    if not (speed > 0 and math.isfinite(speed)):
-        raise InputError("more than 0 rad/s", source="--lead-in-speed", value=speed)
-    world = motion.world
-    way = motion.q[0, world.qadr] - measured
-    seconds = PEAK * float((np.abs(way) / speed).max(initial=0.0))
-    n = math.ceil(seconds * motion.rate)
-    if n == 0:
-        return motion
-    _check_lead_in(motion, plan, measured)
-    x = np.arange(n) / n
-    s = x**3 * (10 - 15 * x + 6 * x**2)
-    rate = 30 * x**2 * (1 - x) ** 2 * motion.rate / n
-    q = np.tile(motion.q[0], (n, 1))
-    q[:, world.qadr] = measured + s[:, None] * way
-    v = np.zeros((n, world.model.nv))
-    v[:, world.dadr] = rate[:, None] * way
-    tau = _lead_in_torques(motion, plan, measured, s)
-    force = motion.force
+def _after(lead: LeadIn, motion: Motion) -> Motion:
+    """The motion with a lead-in before it, which physics has not run."""
+    n, m = len(lead.q), motion
+    force = m.force
     if force is not None:
         force = np.concatenate([np.zeros((n, *force.shape[1:])), force])
-    return Motion(
-        world=world,
-        rate=motion.rate,
-        lead_in=n,
-        q=np.concatenate([q, motion.q]),
-        v=np.concatenate([v, motion.v]),
-        tau=np.concatenate([tau, motion.tau]),
-        contact=np.concatenate(
-            [np.repeat(motion.contact[:1], n, axis=0), motion.contact]
-        ),
-        force=force,
-        state=(
-            np.concatenate([q, motion.state[0]]),
-            np.concatenate([v, motion.state[1]]),
-            np.concatenate([tau, motion.state[2]]),
-        ),
+    q, v, tau = map(np.concatenate, ((lead.q, m.q), (lead.v, m.v), (lead.tau, m.tau)))
+    ran = zip((lead.q, lead.v, lead.tau), m.state, strict=True)
+    contact = np.concatenate([np.repeat(m.contact[:1], n, axis=0), m.contact])
+    state = tuple(map(np.concatenate, ran))
+    return replace(
+        m, lead_in=n, q=q, v=v, tau=tau, contact=contact, force=force, state=state
     )
-
-
-def _on_the_way(motion: Motion, measured: np.ndarray, share: float) -> np.ndarray:
-    """(nq,) the posture after a share of the way."""
-    q = motion.q[0].copy()
-    adr = motion.world.qadr
-    q[adr] = measured + share * (q[adr] - measured)
-    return q
-
-
-def _check_lead_in(motion: Motion, plan: Plan, measured: np.ndarray) -> None:
-    """Refuse a way on which links meet each other or the scene.
-
-    A surface against the support that it stands on is not looked at: where the legs
-    are bent more or less than in the first posture, the base gives way, which is held
-    here.
-    """
-    world = motion.world
-    kin = Kinematics(world)
-    standing = {
-        (g, world.support_geom[c.support])
-        for c in plan.keyframes[0].stance
-        for g in world.surfaces[c.surface].geoms
-    }
-    looked_at = np.array(
-        [not {(a, b), (b, a)} & standing for a, b in world.pairs.tolist()]
-    )
-    way = float(np.abs(motion.q[0, world.qadr] - measured).max())
-    for share in np.linspace(0.0, 1.0, math.ceil(way / CHECK_STEP) + 1):
-        kin.update(_on_the_way(motion, measured, float(share)))
-        near = kin.proximity(0.0, looked_at)
-        if len(near.distance):
-            i = int(np.argmin(near.distance))
-            a, b = (world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]])
-            where = f"after {100 * share:.0f} % of the way" if share else "in it"
-            raise InputError(
-                "a measured posture from which the first one is reached in a straight"
-                f" line: {a} and {b} would meet {where}",
-                source="--lead-in",
-            )
-
-
-def _lead_in_torques(
-    motion: Motion, plan: Plan, measured: np.ndarray, s: np.ndarray
-) -> np.ndarray:
-    """(n, na) that hold the postures on the first contacts, after shares `s` (n,)."""
-    kin = Kinematics(motion.world)
-    stance = plan.keyframes[0].stance
-    nodes = np.linspace(0.0, 1.0, TORQUE_NODES)
-    held = np.array(
-        [holding_torque(kin, _on_the_way(motion, measured, x), stance) for x in nodes]
-    )
-    held[-1] = motion.tau[0]
-    return np.stack([np.interp(s, nodes, column) for column in held.T], axis=1)
 
 
 # CSV.

@@ -18,14 +18,14 @@ from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World, build_world
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
+from clamber.run.codec import whole_file
 from clamber.run.folder import (
+    PLANNED_TRAJECTORY,
     ROLLOUT,
     TIMINGS,
-    TRAJECTORY,
     load_plan,
     load_rollout,
     trajectory_of,
-    whole_file,
 )
 from clamber.show.plots import (
     contact_plot,
@@ -329,7 +329,7 @@ def _readable(folder: Path) -> tuple[Plan, Rollout | None, InputError | None]:
     try:
         plan = load_plan(folder)
     except InputError as e:
-        broken, plan = e, load_plan(folder, without=(TIMINGS, TRAJECTORY))
+        broken, plan = e, load_plan(folder, without=(TIMINGS, PLANNED_TRAJECTORY))
     if (folder / ROLLOUT).exists():
         try:
             rollout = load_rollout(folder)

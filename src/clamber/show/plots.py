@@ -21,7 +21,7 @@ from clamber.model.robot import Robot
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
-from clamber.run.folder import whole_file
+from clamber.run.codec import whole_file
 from clamber.show.sample import Motion
 from clamber.step.posture import STABILITY_WEIGHT
 

@@ -31,7 +31,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World
 from clamber.planning.records import Plan
-from clamber.run.folder import whole_file
+from clamber.run.codec import whole_file
 from clamber.show.sample import describe_change, thinned
 
 Preset = Literal["corner", "side", "front", "behind", "top"]

@@ -28,11 +28,11 @@ from clamber.planning.trajectory import Samples, Trajectory
 from clamber.run.folder import (
     EXECUTION,
     PLAN,
+    PLANNED_SCENE,
+    PLANNED_TRAJECTORY,
     ROLLOUT,
     RUN_MAKERS,
-    SCENE,
     TIMINGS,
-    TRAJECTORY,
     VERDICT,
     load_fields,
     load_plan,
@@ -122,9 +122,9 @@ def read_run(folder: Path) -> Run:
     plan, rollout = None, None
     if written:
         plan = reading.attempt(lambda: load_plan(folder, without=(TIMINGS,)))
-        if plan is None and reading.has(SCENE):
+        if plan is None and reading.has(PLANNED_SCENE):
             plan = reading.attempt(
-                lambda: load_plan(folder, without=(TIMINGS, TRAJECTORY))
+                lambda: load_plan(folder, without=(TIMINGS, PLANNED_TRAJECTORY))
             )
         if ran:
             rollout = reading.attempt(lambda: load_rollout(folder))

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from clamber.run.folder import whole_file
+from clamber.run.codec import whole_file
 from clamber.show.plots import finish_axes, save_plot
 from clamber.study.climb import ClimbResult
 from clamber.study.spec import Spec, Strand, strands

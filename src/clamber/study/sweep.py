@@ -28,7 +28,7 @@ from clamber.errors import ClamberError, InputError, MissingDependency, unreadab
 from clamber.model.robot import load_robot
 from clamber.model.terrain import load_scene
 from clamber.recording.recording import load_demo
-from clamber.run.folder import whole_file
+from clamber.run.codec import whole_file
 from clamber.study.climb import ClimbResult, command_of, run_climb
 from clamber.study.spec import Run, Spec, Strand, goes_on, load_spec, next_runs, strands
 
