@@ -36,7 +36,8 @@ from clamber.planning.substitutes import (
     state_of,
     steps_made,
 )
-from clamber.run.folder import load_plan, load_state, save_plan, save_sequence
+from clamber.run.folder import load_plan, save_plan, save_sequence
+from clamber.run.state import load_state
 from clamber.step.change import Failure
 
 SORE = Failure(status=Status.UNREACHABLE, detail="an elbow is sore")

@@ -637,6 +637,8 @@ def test_plan_and_simulate_of_a_real_sequence_leave_the_files_of_the_format(
     assert {p.name for p in run_folder.iterdir()} == {
         "sequence.json",
         "plan.json",
+        "planned.npz",
+        "planned.xml",
         "trajectory.npz",
         "scene.xml",
         "timings.json",

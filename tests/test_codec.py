@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import json
+import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +20,9 @@ import clamber
 from clamber.contact.policy import GeneralPolicy
 from clamber.contact.steps import Skipped
 from clamber.errors import InputError
-from clamber.execution.executive import Event
-from clamber.execution.simulation import Rollout, Verdict, judge
+from clamber.execution.events import EVENTS, Event
+from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Verdict, judge
 from clamber.model.robot import Limb, Robot
 from clamber.model.scene import Support
 from clamber.model.world import Surface, World
@@ -42,8 +44,9 @@ from records import differences, kinds_in, records_in, same
 
 HERE = Path("made.json")
 # In files of their own (`test_folder`), or below what is.
-ELSEWHERE = {Plan, Rollout, World, Surface, Support, Trajectory, Limb}
-FOR_OTHERS = ("region",)
+ELSEWHERE = {Plan, Rollout, Event, World, Surface, Support, Trajectory, Limb}
+ROUNDED = ("boxes.0.rotation",)  # roll, pitch and yaw there
+FOR_OTHERS = ("region", "text")
 
 
 class Colour(enum.Enum):
@@ -141,11 +144,10 @@ def test_a_record_of_every_kind_of_field_survives_to_the_last_bit(thing: Thing):
 def examples(one_hand_plan: Plan, one_hand_rollout: Rollout) -> dict[type, Any]:
     """One record of each type that goes to a JSON file."""
     plan = one_hand_plan
-    policy = clamber.learn_policy(
-        [clamber.detect_contacts(clamber.load_demo("crossing"))]
-    )
+    demo = clamber.detect_contacts(clamber.load_demo("crossing"))
+    policy = clamber.learn_policy([demo])
     found: dict[type, Any] = {}
-    for x in (plan, policy, judge(plan, one_hand_rollout), *rarer(plan)):
+    for x in (plan, demo, policy, judge(plan, one_hand_rollout), *rarer(plan)):
         for record in records_in(x):
             found.setdefault(type(record), record)
     return found
@@ -155,16 +157,20 @@ def rarer(plan: Plan) -> Iterator[Any]:
     """Records that a plan has which does not get there as demonstrated, or a run."""
     key = plan.keyframes[-1]
     yield Midway(made=1, contacts=key.stance, loaded=key.stance[:1], q=key.q)
-    yield Event(time=0.5, text="LHand touched early")
+    of = {float: 1 / 3, str: "LHand", bool: True, int: 3}
+    for kind in EVENTS.values():
+        yield kind(**{n: of[t] for n, t in typing.get_type_hints(kind).items()})
     yield Skipped(stance=1, reason="out of reach", missed=True)
     yield Iteration(option="ac1", cost=1 / 3)
 
 
 def test_every_record_of_a_file_survives_it_to_the_last_bit(examples: dict[type, Any]):
-    written = set().union(*map(kinds_in, (Plan, GeneralPolicy, Verdict, Rollout)))
+    roots = Plan, GeneralPolicy, Verdict, Rollout, *EVENTS.values()
+    written = set().union(*map(kinds_in, roots))
     for kind in sorted(written - ELSEWHERE, key=lambda k: k.__name__):
         x = examples[kind]  # a new record wants an example
-        assert not list(differences(x, through_text(CODEC, x, kind))), kind
+        off = differences(x, through_text(CODEC, x, kind))
+        assert not [at for at in off if not at.endswith(ROUNDED)], kind
 
 
 def fault_of(kind: Any, content: Any) -> InputError | None:
@@ -181,7 +187,7 @@ def test_a_mistake_in_any_field_is_named_with_the_file(examples: dict[type, Any]
     for kind in examples.keys() - ELSEWHERE - {Robot}:
         whole = CODEC.encode(examples[kind])
         for name in whole:
-            for wrong in (None, {"no": [["field"]]}):
+            for wrong in (None, [[{"no": "field"}]]):
                 broken = {k: v for k, v in whole.items() if k != name}
                 if wrong is not None:
                     broken[name] = wrong

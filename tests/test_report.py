@@ -243,7 +243,9 @@ def test_a_fall_and_a_stop_and_what_was_felt_are_told(
     ("name", "kept"),
     [
         ("plan.json", {"criteria"}),
-        ("scene.xml", {"criteria", "keyframes"}),
+        ("planned.xml", {"criteria", "keyframes"}),
+        ("planned.npz", {"criteria", "keyframes", "motion"}),
+        ("scene.xml", {"criteria", "keyframes", "motion"}),
         ("trajectory.npz", {"criteria", "keyframes", "motion"}),
         ("rollout.npz", {"criteria", "keyframes", "motion"}),
         ("execution.json", {"criteria", "keyframes", "motion"}),
@@ -315,7 +317,7 @@ def test_a_picture_that_is_none_is_left_out(run: Path):
     assert record["missing"] == ["demonstration.png: expected a whole PNG picture"]
 
 
-@pytest.mark.parametrize("content", [None, "{", '{"version": 1}'])
+@pytest.mark.parametrize("content", [None, "{", '{"version": 2}'])
 def test_a_folder_with_nothing_in_it_is_one_sentence(
     content: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -541,7 +543,7 @@ def test_a_phone_sees_all_of_it_without_scrolling_sideways(browser: Any, whole: 
     assert complaints == []
 
 
-@pytest.mark.parametrize("lost", ["plan.json", "scene.xml"])
+@pytest.mark.parametrize("lost", ["plan.json", "planned.xml"])
 def test_a_broken_run_opens_and_says_what_is_missing(
     browser: Any, run: Path, lost: str
 ):

@@ -213,7 +213,7 @@ MISTAKES = {
     "replan run --from 99": ("--from is", "expected a time of the rollout, 0 to"),
     "simulate nowhere": ("nowhere: expected a run folder", "`clamber climb`"),
     "simulate cut": (
-        "cut/plan.json: expected a whole JSON",
+        "cut/plan.json: expected whole JSON",
         "`clamber plan` writes it",
     ),
     "traverse no.json --scene scene.yaml": ("no.json", "check the path"),
@@ -223,7 +223,7 @@ MISTAKES = {
     "learn crossing --out policy.txt": ("--out is 'policy.txt'", "ends in .json"),
     "render nowhere": ("nowhere: expected a run folder", "`clamber plan` makes one"),
     "render empty": ("empty/plan.json", "`clamber plan` writes it"),
-    "render half --video": ("half/trajectory.npz", "`clamber plan` writes it"),
+    "render half --video": ("half/planned.npz", "`clamber plan` writes it"),
     "render run --frame 999": ("--frame is 999.0", "expected a time from 0 to"),
     "render run --frame 1 --sheet": ("--sheet, --frame", "give one of them alone"),
     "render run --transparent": ("--transparent", "give --frame too, or leave it out"),
@@ -235,7 +235,7 @@ MISTAKES = {
     "export run --to xml": ("'xml'", "'mcap'"),
     "export run --to csv --rate 7": ("--rate is 7", "a divisor of 1000 Hz, as 50"),
     "export run --to csv --layout mjlab": ("--layout is", "it goes with --to npz"),
-    "export half --to csv": ("half/trajectory.npz", "`clamber plan` writes it"),
+    "export half --to csv": ("half/planned.npz", "`clamber plan` writes it"),
     "scene word.txt": ("word.txt is 'str'", "expected a mapping of fields"),
     "robot check nobody": ("'nobody'", "a robot.yaml, or one of coman, coman29"),
     "robot init no.urdf": ("no.urdf: expected a readable file", "check the path"),
@@ -259,7 +259,7 @@ def mistaken(folder: Path) -> Path:
         "typo.yaml": "grid: {disturb.fricton: [1, 2]}\n",
         "cut/plan.json": (folder / "run" / "plan.json").read_text()[:500],
         "half/plan.json": (folder / "run" / "plan.json").read_text(),
-        "half/scene.xml": (folder / "run" / "scene.xml").read_text(),
+        "half/planned.xml": (folder / "run" / "planned.xml").read_text(),
         "empty/.keep": "",
     }.items():
         (folder / name).parent.mkdir(exist_ok=True)

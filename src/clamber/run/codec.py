@@ -1,8 +1,8 @@
 """Records <-> JSON and npz, by the type hints of their fields.
 
 A record is an object of its fields, an array nested lists, an enum its name (of words,
-its value), one of several records an object that says its `type`. What is None, False or empty text by
-default is left out while it is so. A `Form` says where a file differs from that.
+its value), one of several records an object that says its `type`. What is None, False
+or empty text by default is left out while it is so. A `Form` says where a file differs.
 Reading checks everything and names file, field, value and what was expected.
 
 A file is written beside its place and renamed, so that an interrupted run leaves whole
@@ -290,7 +290,7 @@ class Codec:
             if isinstance(value, Mapping):
                 out[f"{key}_keys"] = np.array([*value], dtype=str)
                 out[key] = np.array([*value.values()], dtype=float)
-            elif isinstance(value, tuple) and not all(map(_is_text, value)):
+            elif isinstance(value, tuple) and not _is_names(hints[f.name]):
                 out[key] = np.array(json.dumps(self.encode(value, hints[f.name])))
             else:
                 out[key] = value
@@ -328,7 +328,7 @@ class Codec:
             elif isinstance(origin, type) and issubclass(origin, Mapping):
                 keys = arrays.get(f"{key}_keys", (len(x),), known)
                 out[f.name] = dict(zip(keys.tolist(), x.tolist(), strict=True))
-            elif origin is tuple and x.shape:
+            elif _is_names(hint):
                 out[f.name] = tuple(x.tolist())
             elif origin is tuple:
                 at = At(parse(x.item(), arrays.file, key), arrays.file, key)
@@ -359,6 +359,10 @@ def _items(kind: Any, n: int) -> list[Any]:
             args = typing.get_args(k)
             return [args[0]] * n if args[1:] in ((), (...,)) else [*args]
     return [None] * n
+
+
+def _is_names(hint: Any) -> bool:
+    return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] is str
 
 
 def _named(kind: Any) -> str:

@@ -14,7 +14,6 @@ import filecmp
 import hashlib
 import importlib.metadata
 import json
-import os
 import shutil
 from collections.abc import Collection, Mapping
 from dataclasses import fields
@@ -193,7 +192,7 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
         _save_world(plan.world, folder / name)
     if plan.trajectory is not None:
         save_trajectory(plan.trajectory, folder / PLANNED_TRAJECTORY)
-        _share(folder / PLANNED_TRAJECTORY, folder / TRAJECTORY)
+        _copy(folder / PLANNED_TRAJECTORY, folder / TRAJECTORY)
     save_timings(folder, plan.timings)
     write_json(folder / PLAN, _plan_fields(plan, folder))
 
@@ -339,15 +338,9 @@ def _load_timings(folder: Path) -> dict[str, float]:
     return CODEC.decode(dict[str, float], _read(folder / TIMINGS).key("seconds"))
 
 
-def _share(source: Path, target: Path) -> None:
-    """The same file under another name, or a copy where there can be no two."""
-    if target.exists() and target.samefile(source):
-        return
+def _copy(source: Path, target: Path) -> None:
     with whole_file(target) as draft:
-        try:
-            os.link(source, draft)
-        except OSError:
-            shutil.copyfile(source, draft)
+        shutil.copyfile(source, draft)
 
 
 def _are_same(a: Path, b: Path) -> bool:
@@ -458,7 +451,7 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     _save_world(rollout.world, folder / SCENE)
     planned = folder / PLANNED_TRAJECTORY
     if rollout.followed is None and planned.exists():
-        _share(planned, folder / TRAJECTORY)
+        _copy(planned, folder / TRAJECTORY)
     else:
         followed = rollout.followed or trajectory_of(plan, folder)
         save_trajectory(followed, folder / TRAJECTORY)
