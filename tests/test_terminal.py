@@ -207,7 +207,7 @@ MISTAKES = {
     "contacts no.bvh": ("no.bvh: expected a readable file", "check the path"),
     "plan no.json": ("no.json: expected a readable file", "check the path"),
     "plan empty": ("empty/sequence.json", "`clamber contacts` writes it"),
-    "plan word.txt": ("word.txt: expected a whole JSON file", "check the path"),
+    "plan word.txt": ("word.txt: expected whole JSON", "check the path"),
     "plan run/plan.json": ("run/plan.json", "expected a value: it is missing"),
     "replan empty --from 3": ("empty/plan.json", "`clamber plan` writes it"),
     "replan run --from 99": ("--from is", "expected a time of the rollout, 0 to"),

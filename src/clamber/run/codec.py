@@ -192,8 +192,8 @@ class Codec:
                     return form.read(at)
                 return kind(**self.fields(kind, at))
             except (ValueError, KeyError) as e:
-                reason = f"what fits together ({e.args[0] if e.args else e})"
-                raise at.error(reason) from e
+                reason = e.args[0] if e.args else e
+                raise at.error(f"fields that fit together ({reason})") from e
         if kind is np.ndarray:
             return _array(at, math.nan, None)
         if isinstance(origin, type) and issubclass(origin, Mapping):
