@@ -26,6 +26,7 @@ from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.planning.records import Plan
 from clamber.run import folder as io
+from clamber.step.change import Failure
 from records import differences, same
 
 PLAN_FILES = {
@@ -216,7 +217,7 @@ def test_a_missing_sequence_is_named(tmp_path: Path):
 
 def test_a_loaded_plan_is_the_one_that_was_made(plan: Plan, saved: Path):
     assert plan.complete
-    assert len(plan.paths) == 1
+    assert len(plan.changes) == 1
     assert not list(differences(io.load_plan(saved), plan))
 
 
@@ -271,6 +272,7 @@ def test_the_plan_names_what_it_was_made_of(plan: Plan, saved: Path):
     assert all(len(h) == 64 for h in content["inputs"].values())
     assert content["prefixes"]["LKnee"] == "LKnee"
     assert str(ROBOTS) not in (saved / "plan.json").read_text()
+    assert content["changes"][0]["step"]["makes"]["surface"] == "LHand"
     key = content["keyframes"][-1]
     assert {c["surface"] for c in key["contacts"]} == {"LFoot", "RFoot", "LHand"}
     for c in key["contacts"]:
@@ -324,7 +326,8 @@ def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path
         residuals=replace(plan.keyframes[-1].residuals, com_margin=-np.inf),
     )
     skipped = (Skipped(stance=4, reason="out of reach"),)
-    stuck = replace(plan, keyframes=(key,), skipped=skipped)
+    failed = (Failure(status=Status.UNREACHABLE, step=plan.changes[0].step),)
+    stuck = replace(plan, start=key, changes=(), skipped=skipped, failures=failed)
     io.save_plan(stuck, tmp_path)
     assert "Infinity" not in (tmp_path / io.PLAN).read_text()
     assert same(io.load_plan(tmp_path), stuck)
@@ -337,6 +340,8 @@ def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path
         (lambda c: c["keyframes"][0]["qpos"].pop(), "keyframes.0.qpos"),
         (lambda c: c["keyframes"][1].update(status="FINE"), "keyframes.1.status"),
         (lambda c: c["options"].update(method="luck"), "options.method"),
+        (lambda c: c["changes"].pop(), "keyframes"),
+        (lambda c: c["changes"][0]["phases"][1]["q"].clear(), "changes.0.phases.1.q"),
         (
             lambda c: c["keyframes"][0]["contacts"][0].update(surface="Tail"),
             "keyframes.0.contacts",

@@ -15,13 +15,14 @@ import hashlib
 import importlib.metadata
 import json
 import shutil
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
+import numpy as np
 
 from clamber.contact.contact import ContactSequence
 from clamber.contact.policy import GeneralPolicy
@@ -32,8 +33,9 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.propose import Proposal, robot_yaml
 from clamber.model.robot import Robot
 from clamber.model.scene import Scene
+from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
-from clamber.planning.records import Plan
+from clamber.planning.records import Fallback, Plan
 from clamber.planning.substitutes import Replanned
 from clamber.planning.trajectory import Trajectory
 from clamber.run.codec import (
@@ -46,6 +48,7 @@ from clamber.run.codec import (
     write_npz,
 )
 from clamber.run.forms import CODEC
+from clamber.step.change import Change
 from clamber.step.posture import Keyframe
 from clamber.step.stability import contact_points
 
@@ -69,7 +72,7 @@ _OF_A_PLAN = (PLAN, PLANNED_SCENE, PLANNED_TRAJECTORY, TIMINGS, REPLANNED)
 _MAKERS = {SEQUENCE: "contacts", POLICY: "learn"} | dict.fromkeys(_OF_A_PLAN, "plan")
 _MAKERS |= dict.fromkeys(_OF_A_RUN, "simulate")
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
-_NOT_IN_PLAN = ("world", "trajectory", "timings")
+_NOT_IN_PLAN = ("world", "trajectory", "timings", "start", "changes")
 _IN_EXECUTION = ("events", "fell", "rests_on")
 _NOT_IN_ROLLOUT = ("world", "followed", *_IN_EXECUTION)
 _NOT_IN_EXECUTION = tuple(
@@ -215,6 +218,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "prefixes": dict(world.robot.prefixes),
         **CODEC.object(plan, without=_NOT_IN_PLAN),
         "keyframes": [keyframe_fields(k, kin) for k in plan.keyframes],
+        "changes": [CODEC.object(c, without=("keyframe",)) for c in plan.changes],
     }
 
 
@@ -252,32 +256,57 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     known = _plan_of(at)
     robot = CODEC.decode(Robot, at.key("robot"))
     world = _load_world(folder / PLANNED_SCENE, robot, known["sequence"].scene)
-    for i, k in enumerate(known["keyframes"]):
-        _check_keyframe(at.key("keyframes").list()[i], k, world)
     trajectory, path = None, folder / PLANNED_TRAJECTORY
     if PLANNED_TRAJECTORY not in without and (path.exists() or known["complete"]):
         trajectory = load_trajectory(path, world)
     timings: dict[str, float] = {}
     if TIMINGS not in without and (folder / TIMINGS).exists():
         timings = _load_timings(folder)
-    return Plan(world=world, trajectory=trajectory, timings=timings, **known)
+    plan = Plan(world=world, trajectory=trajectory, timings=timings, **known)
+    for field, q in _postures(plan):
+        if q.shape[-1] != world.model.nq:
+            expected = f"{world.model.nq} numbers, the coordinates of {PLANNED_SCENE}"
+            raise InputError(expected, at.file, field, f"{q.shape[-1]} numbers")
+    for i, k in enumerate(plan.keyframes):
+        for c in k.stance:
+            if c.surface not in world.surfaces or c.support not in world.supports:
+                field, value = f"keyframes.{i}.contacts", f"{c.surface} on {c.support}"
+                expected = f"a surface of the robot on a support of {PLANNED_SCENE}"
+                raise InputError(expected, at.file, field, value)
+    return plan
+
+
+def _postures(plan: Plan) -> Iterator[tuple[str, np.ndarray]]:
+    """Every posture of a plan, (..., nq), and the name of its field."""
+    for i, k in enumerate(plan.keyframes):
+        yield f"keyframes.{i}.qpos", k.q
+    for i, c in enumerate(plan.changes):
+        for j, phase in enumerate(c.phases):
+            yield f"changes.{i}.phases.{j}.q", phase.q
+    if plan.state is not None:
+        yield "state.qpos", plan.state.q
 
 
 def _plan_of(at: At) -> dict[str, Any]:
     """The fields of a plan that `plan.json` holds."""
-    return CODEC.fields(Plan, at, without=_NOT_IN_PLAN)
+    keyframes = CODEC.decode(tuple[Keyframe, ...], at.key("keyframes"))
+    changes = at.key("changes").list()
+    if len(keyframes) != len(changes) + 1:
+        expected = f"{len(changes) + 1}, one more than there are changes"
+        raise at.key("keyframes").error(expected, f"{len(keyframes)} keyframes")
+    return CODEC.fields(Plan, at, without=_NOT_IN_PLAN) | {
+        "start": keyframes[0],
+        "changes": tuple(
+            Change(**CODEC.fields(Change, of, without=("keyframe",)), keyframe=k)
+            for of, k in zip(changes, keyframes[1:], strict=True)
+        ),
+    }
 
 
-def _check_keyframe(at: At, k: Keyframe, world: World) -> None:
-    """Refuse a keyframe of another robot or scene."""
-    nq = world.model.nq
-    if k.q.shape != (nq,):
-        expected = f"{nq} numbers, as many as {PLANNED_SCENE} has coordinates"
-        raise at.key("qpos").error(expected, f"{k.q.size} numbers")
-    for c in k.stance:
-        if c.surface not in world.surfaces or c.support not in world.supports:
-            expected = f"a surface of the robot on a support of {PLANNED_SCENE}"
-            raise at.key("contacts").error(expected, f"{c.surface} on {c.support}")
+def fallback_note(written: Mapping[str, Any]) -> str:
+    """What the fields of a `plan.json` say of its fallback; empty without one."""
+    fields = written.get("fallback")
+    return "" if fields is None else str(Fallback(**fields))
 
 
 def trajectory_of(plan: Plan, source: Path) -> Trajectory:
@@ -409,13 +438,15 @@ def _with_assets(root: ElementTree.Element, base: Path) -> dict[bytes, str]:
 
 
 def save_proposal(proposal: Proposal, folder: str | Path) -> None:
-    """Write `robot.yaml` and the model that it names into a folder."""
-    for name, text in (
-        (proposal.fields["model"], proposal.mjcf),
-        (ROBOT, robot_yaml(proposal)),
-    ):
-        with whole_file(Path(folder) / name) as draft:
-            draft.write_text(text)
+    """Write `robot.yaml`, the model that it names, and meshes into a folder."""
+    files = {f"{MESH_FOLDER}/{n}": content for n, content in proposal.files.items()}
+    files[proposal.fields["model"]] = proposal.mjcf.encode()
+    files[ROBOT] = robot_yaml(proposal).encode()
+    for name, content in files.items():
+        path = Path(folder) / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as draft:
+            draft.write_bytes(content)
 
 
 def save_replanned(found: Replanned, folder: str | Path) -> None:
@@ -430,8 +461,8 @@ def save_replanned(found: Replanned, folder: str | Path) -> None:
                     "surfaces": r.surfaces,
                     "cost": r.cost,
                     "stable": r.stable,
-                    "moves": [str(p.transition.step) for p in r.plan.paths],
-                    "missed": [s.reason for s in r.plan.skipped if s.missed],
+                    "moves": [str(c.step) for c in r.plan.changes],
+                    "missed": [str(f) for f in r.plan.failures],
                 }
                 for r in found.ranked
             ],

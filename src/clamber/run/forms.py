@@ -17,9 +17,10 @@ from clamber.execution.verdict import Criterion
 from clamber.model.robot import ROBOTS, Robot, RobotFile, robot_of
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy, rpy_from_matrix
-from clamber.planning.records import Midway
+from clamber.planning.records import State
 from clamber.planning.trajectory import Trajectory
 from clamber.run.codec import At, Codec, Form
+from clamber.step.change import Failure
 from clamber.step.ik import Residuals
 from clamber.step.path import Phase
 from clamber.step.posture import Keyframe
@@ -148,7 +149,10 @@ FORMS: dict[type, Form] = {
     ContactInterval: Form(beside=("contact",)),
     ContactState: Form(beside=("contact",)),
     PelvisDistribution: Form(null={"sigma": math.inf}),
-    Midway: Form(names={"q": "qpos"}),
+    State: Form(names={"q": "qpos"}),
+    Failure: Form(
+        more=lambda f: {"stance": f.step and f.step.stance, "reason": str(f)}
+    ),
     Phase: Form(columns={"arc": 3}),
     Keyframe: Form(
         names={"q": "qpos", "equilibrium": "static_equilibrium"},
