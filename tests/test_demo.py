@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from clamber.errors import InputError
 from clamber.model.scene import Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.terrain import read_obj
-from clamber.recording.built_in import BUILT_IN
 from clamber.recording.demonstration import (
     Demonstration,
     RawTracks,
@@ -26,8 +24,6 @@ from clamber.recording.demonstration import (
 )
 from clamber.recording.recording import load_demo
 from clamber.recording.skeleton import recognise
-from support.built_in import MADE, SEED
-from support.climb import ClimbOptions, synthesize_climb
 
 NAMES = [
     "Hips",
@@ -358,127 +354,6 @@ def test_a_point_never_seen_is_dropped_unless_it_is_needed():
 def test_runs_are_half_open_ranges():
     assert runs(np.array([1, 0, 1, 1, 0, 1], dtype=bool)) == [(0, 1), (2, 4), (5, 6)]
     assert runs(np.zeros(3, dtype=bool)) == []
-
-
-# The built-in climb.
-
-
-@cache
-def clean(**options) -> tuple[Demonstration, list]:
-    options = ClimbOptions(noise=0.0, gaps=0, **options)
-    return synthesize_climb(np.random.default_rng(3), options=options)
-
-
-HEIGHTS = [0.57, 0.94, 1.12]
-
-
-@pytest.mark.parametrize("ratio", HEIGHTS)
-def test_limbs_of_the_built_in_climb_never_change_length(ratio):
-    demo, _ = clean(height_ratio=ratio)
-    for a, b, length in SEGMENTS.values():
-        for s in "LR":
-            d = np.linalg.norm(demo.point(s + a) - demo.point(s + b), axis=1)
-            np.testing.assert_allclose(d, length, atol=1e-6)
-
-
-@pytest.mark.parametrize("ratio", HEIGHTS)
-def test_what_truly_touches_is_perfectly_still_in_the_clean_climb(ratio):
-    demo, truth = clean(height_ratio=ratio)
-    for i in truth:
-        held = (demo.t >= i.t0) & (demo.t <= i.t1)
-        point = "Foot.toe" if i.part.endswith("Foot") else i.part[1:]
-        p = demo.point(i.part[0] + point)[held]
-        assert np.ptp(p, axis=0).max() < 1e-6
-        height = demo.scene.support(i.contact.support).height(p)
-        assert np.all((height > 0.0) & (height < 0.12))
-
-
-@pytest.mark.parametrize("ratio", HEIGHTS)
-def test_no_limb_of_the_climb_goes_through_the_box(ratio):
-    demo, _ = clean(height_ratio=ratio)
-    box = demo.scene.boxes[0]
-    bones = [(s + a, s + b) for s in "LR" for a, b, _ in SEGMENTS.values()]
-    bones += [(s + "Foot", s + "Foot.toe") for s in "LR"] + [("Pelvis", "Neck")]
-    for a, b in bones:
-        for share in np.linspace(0.0, 1.0, 9):
-            p = (1 - share) * demo.point(a) + share * demo.point(b) - box.position
-            depth = np.min(box.size / 2 - np.abs(p @ box.rotation), axis=1)
-            assert depth.max() < -0.01, (a, b, demo.t[np.argmax(depth)])
-
-
-@pytest.mark.parametrize("ratio", HEIGHTS)
-def test_knees_and_ankles_bend_the_way_they_do(ratio):
-    demo, _ = clean(height_ratio=ratio)
-    left = demo.point("LHip") - demo.point("RHip")
-    for s in "LR":
-        hip, knee, ankle = (demo.point(s + n) for n in ("Hip", "Knee", "Foot"))
-        bend = np.sum(np.cross(knee - hip, ankle - knee) * left, axis=1)
-        assert bend.min() > -1e-3  # the shank turns back about the axis to the left
-        toe = demo.point(s + "Foot.toe") - ankle
-        assert np.sum(np.cross(ankle - knee, toe) * left, axis=1).max() < 0.02
-
-
-def test_the_climb_is_continuous():
-    demo, _ = clean()
-    steps = np.linalg.norm(np.diff(demo.position, axis=0), axis=2)
-    assert steps.max() * demo.rate < 3.0  # [m/s]; a jump of 3 cm would be 3.6
-
-
-def test_the_climb_shows_eight_contacts_in_the_asked_for_order():
-    demo, truth = clean()
-    table = [i.part for i in truth if i.contact.support == "table"]
-    assert table == ["LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee"]
-    off = {i.part: i.t1 for i in truth if i.contact.support == "ground"}
-    on = {i.part: i.t0 for i in truth}
-    assert on["RElbow"] < off["LFoot"] < on["LKnee"] < off["RFoot"] < on["RKnee"]
-    mirrored = clean(mirrored=True)[1]
-    assert next(i.part for i in mirrored if i.contact.support == "table") == "RHand"
-    assert 20.0 <= demo.t[-1] <= 25.0
-    assert "synthetic" in demo.source
-    assert demo.synthetic
-
-
-def test_a_mirrored_climb_is_the_mirror_image():
-    (a, _), (b, _) = clean(), clean(mirrored=True)
-    for name in a.names:
-        other = {"L": "R", "R": "L"}[name[0]] + name[1:] if name[0] in "LR" else name
-        image = b.point(other) * [1.0, -1.0, 1.0]
-        if name not in ("Neck", "Head", "Pelvis"):
-            np.testing.assert_allclose(a.point(name), image, atol=1e-12)
-
-
-def test_the_built_in_climb_is_always_the_same_and_another_seed_another_one():
-    a, b = load_demo("climb"), load_demo("climb")
-    np.testing.assert_array_equal(a.position, b.position)
-    other, _ = synthesize_climb(np.random.default_rng(1))
-    assert not np.array_equal(a.position, other.position)
-    assert any(g.filled for g in a.gaps)
-
-
-@pytest.mark.parametrize("name", BUILT_IN)
-def test_the_shipped_demonstrations_are_what_their_generators_make(name):
-    synthesize, _, options = MADE[name]
-    made, _ = synthesize(np.random.default_rng(SEED), options=options)
-    shipped = load_demo(name)
-    np.testing.assert_allclose(shipped.position, made.position, atol=1e-16)
-    np.testing.assert_array_equal(shipped.t, made.t)
-    assert (shipped.names, shipped.source, shipped.gaps) == (
-        made.names, made.source, made.gaps,
-    )  # fmt: skip
-    (box,), (other,) = shipped.scene.boxes, made.scene.boxes
-    np.testing.assert_array_equal(
-        [box.size, box.position], [other.size, other.position]
-    )
-
-
-def test_noise_is_as_large_as_asked_for():
-    quiet, _ = synthesize_climb(
-        np.random.default_rng(3), options=ClimbOptions(noise=0.0, gaps=0)
-    )
-    loud, _ = synthesize_climb(
-        np.random.default_rng(3), options=ClimbOptions(noise=0.005, gaps=0)
-    )
-    assert np.std(loud.position - quiet.position) == pytest.approx(0.005, rel=0.02)
 
 
 def test_importing_demonstrations_does_not_import_scipy():
