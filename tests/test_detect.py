@@ -22,10 +22,10 @@ from clamber.recording.demonstration import (
 from clamber.recording.detect import (
     SEAT,
     DetectOptions,
-    _fit_instant,
-    _hysteresis,
-    _noise,
     detect_contacts,
+    fit_instant,
+    hysteresis,
+    noise_of,
 )
 from clamber.recording.recording import load_demo
 from support.climb import ClimbOptions, synthesize_climb
@@ -294,14 +294,14 @@ def test_changes_closer_than_merge_are_one_change_of_stance():
 def test_hysteresis_begins_strict_and_lasts_while_loose():
     loose = np.array([1, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 0, 1, 1], dtype=bool)
     strict = np.array([0, 1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 0, 1, 0], dtype=bool)
-    assert _hysteresis(strict, loose, 2) == [(0, 2), (4, 8), (12, 14)]
-    assert _hysteresis(strict, loose, 3) == [(4, 8)]
+    assert hysteresis(strict, loose, 2) == [(0, 2), (4, 8), (12, 14)]
+    assert hysteresis(strict, loose, 3) == [(4, 8)]
 
 
 def test_noise_is_measured_on_a_moving_track(rng):
     t = np.linspace(0, 10, 1200)[:, None]
     track = np.sin(t * [1.0, 2.0, 0.5]) + 0.004 * rng.standard_normal((1200, 3))
-    assert _noise(track) == pytest.approx(0.004, rel=0.1)
+    assert noise_of(track) == pytest.approx(0.004, rel=0.1)
 
 
 @pytest.mark.parametrize("true", [45, 52, 58])
@@ -309,7 +309,7 @@ def test_the_instant_of_touching_is_fitted_through_noise(rng, true):
     s = np.arange(100)
     p = np.maximum(true - s, 0)[:, None] / 120 * [0.1, 0.0, 0.35]
     p = p + 0.002 * rng.standard_normal((100, 3))
-    assert abs(_fit_instant(p, 50, 12) - true) <= 2
+    assert abs(fit_instant(p, 50, 12) - true) <= 2
 
 
 def recording(shared, folder, tmp_path, **fields):

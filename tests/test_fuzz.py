@@ -27,6 +27,7 @@ from clamber.recording.recording import load_demo, read_points
 from support.climb import ClimbOptions, synthesize_climb
 from support.files import (
     MOTIVE,
+    box_obj,
     bvh_text,
     c3d_bytes,
     motive_csv,
@@ -34,7 +35,6 @@ from support.files import (
     smpl_joints,
     write_take,
 )
-from test_demo import box_obj
 
 SLOWEST = 5.0  # [s]
 LARGEST = 10  # times the file

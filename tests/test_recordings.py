@@ -26,7 +26,7 @@ from clamber.recording.demonstration import (
 from clamber.recording.detect import detect_contacts
 from clamber.recording.points import unique_names
 from clamber.recording.recording import load_demo, read_points
-from clamber.recording.skeleton import recognise
+from clamber.recording.skeleton import recognise, solve_centres
 from conftest import ROOT
 from support.climb import ClimbOptions, synthesize_climb
 from support.files import (
@@ -72,10 +72,8 @@ def check_contacts(demo: Demonstration, truth, within: float = 0.06) -> None:
     ("options", "unit", "up"),
     [
         ({}, "mm", "z"),
-        ({"rate": 60.0, "gaps": 20}, "m", "y"),
         ({"rate": 240.0, "noise": 0.004}, "cm", "-y"),
-        ({"height_ratio": 0.7}, "mm", "x"),
-        ({"rate": 100.0, "mirrored": True}, "m", "-z"),
+        ({"rate": 100.0, "mirrored": True, "gaps": 20}, "m", "x"),
     ],
     ids=str,
 )
@@ -90,9 +88,11 @@ def test_an_array_gives_the_true_contacts_whatever_its_unit_axis_and_rate(
     assert f"up: {up} (" in " ".join(back.notes)
 
 
-@pytest.mark.parametrize("options", [{}, {"rate": 200.0, "gaps": 20, "noise": 0.004}])
-@pytest.mark.parametrize("suffix", ["c3d", "trc"])
-def test_what_is_written_is_read_again(tmp_path, options, suffix):
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [("c3d", {}), ("trc", {"rate": 200.0, "gaps": 20, "noise": 0.004})],
+)
+def test_markers_of_a_file_give_the_true_contacts(tmp_path, suffix, options):
     demo, truth = climb(**options)
     valid = demo.valid.copy()
     valid[300:500, demo.names.index("LHand.tip")] = False
@@ -111,8 +111,9 @@ def test_what_is_written_is_read_again(tmp_path, options, suffix):
     check_contacts(back, truth)
 
 
-@pytest.mark.parametrize("parent", [False, True])
-@pytest.mark.parametrize(("unit", "word"), [("m", "Meters"), ("mm", "Millimeters")])
+@pytest.mark.parametrize(
+    ("unit", "word", "parent"), [("m", "Meters", False), ("mm", "Millimeters", True)]
+)
 def test_motive_bones_give_the_true_contacts(tmp_path, unit, word, parent):
     demo, truth = climb(rate=100.0, gaps=15)
     p = from_z_up(holed(demo), "y") * METRE[unit]
@@ -128,7 +129,6 @@ def test_motive_bones_give_the_true_contacts(tmp_path, unit, word, parent):
     ("order", "unit", "scale"),
     [
         ("ZXY", "cm", 100.0),
-        ("XYZ", "m", 1.0),
         ("YZX", "inches", 1 / 0.0254),
         ("ZYX", "CMU's", 0.45 / 0.0254),
     ],
@@ -171,8 +171,6 @@ def test_markers_on_both_sides_of_a_joint_are_averaged():
             "{s}SHO", "{s}ELB", "{s}WRA", "{s}WRB", "{s}FIN",
         )
     ]  # fmt: skip
-    from clamber.recording.skeleton import solve_centres
-
     found = recognise(names)
     assert found.on_skin
     rng = np.random.default_rng(0)
@@ -187,8 +185,6 @@ def test_parts_go_before_the_joints_of_a_marker_set():
     found = recognise(GAIT, parts={"LKnee": "LTIB", "RHand": ["RFIN", "RWRA"]})
     assert found.on_skin
     assert "`parts`" in found.name
-    from clamber.recording.skeleton import solve_centres
-
     track = {i: np.full((2, 3), float(i)) + np.eye(3)[:2] * i for i in found.used()}
     points = solve_centres(found, track)
     np.testing.assert_array_equal(points["LKnee"], track[GAIT.index("LTIB")])
@@ -196,28 +192,17 @@ def test_parts_go_before_the_joints_of_a_marker_set():
     np.testing.assert_array_equal(points["RHand.1"], track[GAIT.index("RWRA")])
 
 
-def test_a_thin_box_is_never_turned_inside_out():
-    demo, _ = climb()
-    from clamber.recording.demonstration import _raised
-
-    box = replace(demo.scene.boxes[0], size=np.array([1.0, 1.0, 0.02]))
-    assert _raised(box, -0.05).size[2] == pytest.approx(1e-3)
-
-
 def test_hips_are_where_the_regression_puts_them():
     """Harrington's numbers, for a pelvis 250 mm wide and 150 mm deep at the origin."""
-    from clamber.recording.skeleton import _hips
-
-    place = {
-        "LAsis": [0, 0.125, 0], "RAsis": [0, -0.125, 0], "LPsis": [-0.15, 0.04, 0],
-        "RPsis": [-0.15, -0.04, 0],
-    }  # fmt: skip
-    hips = _hips({k: np.array([v], dtype=float) for k, v in place.items()})
+    place = {"ASI": [0, 0.125, 0], "PSI": [-0.15, 0.04, 0], "SHO": [0, 0.2, 0.5]}
+    track = {}
+    for k, name in enumerate(GAIT):
+        x, y, z = place.get(name[1:], [0.01 * k, 0.1, -0.01 * k])
+        track[k] = np.array([[x, y if name[0] == "L" else -y, z]], dtype=float)
+    points = solve_centres(recognise(GAIT), track)
     expected = [-0.24 * 0.15 - 0.0099, 0.33 * 0.25 + 0.0073, -0.30 * 0.25 - 0.0109]
-    np.testing.assert_allclose(hips["L"][0], expected, atol=1e-12)
-    np.testing.assert_allclose(
-        hips["R"][0], expected * np.array([1, -1, 1]), atol=1e-12
-    )
+    np.testing.assert_allclose(points["LHip"][0], expected, atol=1e-12)
+    np.testing.assert_allclose(points["RHip"][0] * [1, -1, 1], expected, atol=1e-12)
 
 
 # Names.
@@ -249,7 +234,7 @@ SKELETONS = {
 
 
 @pytest.mark.parametrize("name", SKELETONS)
-@pytest.mark.parametrize("prefix", ["", "Anna:", "Anna_", "Take 3:Anna:"])
+@pytest.mark.parametrize("prefix", ["", "Take 3:Anna:"])
 def test_skeletons_are_recognised_by_their_names(name, prefix):
     text, joints, pelvis = SKELETONS[name]
     names = [prefix + n for n in text.split()]
@@ -287,7 +272,7 @@ GAIT = (
     ],
     ids=["baseline 37", "baseline 41", "plug-in gait"],
 )
-@pytest.mark.parametrize("prefix", ["", "Anna:", "Anna_"])
+@pytest.mark.parametrize("prefix", ["", "Anna_"])
 def test_marker_sets_are_recognised_by_their_names(names, called, knee, prefix):
     assert len(names) in (37, 39, 41)
     names = [prefix + n for n in names]
@@ -377,19 +362,6 @@ def test_what_recording_yaml_says_goes_before_what_the_file_says(tmp_path):
     assert load_demo(tmp_path / "take.c3d", rate=50.0).rate == pytest.approx(50.0)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("unit", "furlong"), ("unit", 0), ("up", "w"), ("offsets", {"Nose": 0.1}),
-     ("offsets", {"Knee": 7}), ("subject", "Nobody"),
-     ("parts", {"LHand": {"body": "x"}})],
-)  # fmt: skip
-def test_a_wrong_field_of_recording_yaml_is_named(tmp_path, field, value):
-    demo, _ = climb(rate=60.0, gaps=0)
-    write_take(demo, tmp_path / "take.c3d")
-    with pytest.raises(InputError, match=field):
-        load_demo(described(tmp_path, file="take.c3d", **{field: value}))
-
-
 def test_an_inch_is_an_inch(tmp_path):
     p = from_z_up(climb(rate=60.0)[0].position, "y") / 0.0254
     demo = climb(rate=60.0)[0]
@@ -455,7 +427,7 @@ def test_axes_are_turned_and_never_mirrored(up):
 # BVH's kinematics against an independent computation.
 
 
-@pytest.mark.parametrize("order", ["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "ZXZ"])
+@pytest.mark.parametrize("order", ["XYZ", "YXZ", "ZYX", "ZXZ"])
 def test_bvh_rotations_multiply_in_the_order_in_which_they_are_listed(
     tmp_path, order, rng
 ):
@@ -542,22 +514,11 @@ def test_every_dialect_of_c3d_is_read(tmp_path, order, scale, analog, rng):
     np.testing.assert_allclose(points.position, p[:, :3], rtol=1e-6, atol=1e-4)
 
 
-def test_more_samples_than_16_bits_hold_are_written_and_read(tmp_path):
-    demo, _ = climb(rate=60.0, gaps=0)
-    n = 70_001
-    names = demo.names[:13]
-    keep = np.arange(n) % len(demo.t)
-    long = replace(
-        demo, t=np.arange(n) / 60.0, position=demo.position[keep],
-        valid=np.ones((n, len(demo.names)), dtype=bool),
-    )  # fmt: skip
-    write_take(long, tmp_path / "long.c3d")
+def test_more_samples_than_16_bits_hold_are_read(tmp_path, rng):
+    p = rng.uniform(-2000, 2000, size=(70_001, 3, 3))
+    (tmp_path / "long.c3d").write_bytes(c3d_bytes(p, "abc"))
     points = read_points(tmp_path / "long.c3d")
-    assert points.position.shape == (n, len(demo.names), 3)
-    k = demo.names.index(names[4])
-    np.testing.assert_allclose(
-        points.position[-1, k] / 1000, long.position[-1, k], atol=1e-6
-    )
+    np.testing.assert_allclose(points.position, p, rtol=1e-6)
 
 
 def test_a_real_motive_file_is_read(shared, tmp_path):
@@ -645,6 +606,17 @@ def test_a_floor_and_a_box_that_are_off_are_put_right(floor, top):
     assert table.position[2] - table.size[2] / 2 == pytest.approx(0.0, abs=1e-9)
     assert any(f"ground {1000 * floor:+.0f} mm" in n for n in right.notes) or floor == 0
     check_contacts(right, truth)
+
+
+def test_a_thin_box_is_never_turned_inside_out():
+    demo, _ = climb()
+    box = demo.scene.boxes[0]
+    size, lower = np.array([*box.size[:2], 0.02]), (box.size[2] / 2 - 0.01) * UP
+    thin = replace(box, size=size, position=box.position + lower)
+    offsets = {**demo.offsets, "Knee": demo.offsets["Knee"] + 0.05}
+    scene = replace(demo.scene, boxes=(thin,))
+    fitted = fit_levels(replace(demo, scene=scene, offsets=offsets)).scene.boxes[0]
+    assert fitted.size[2] == pytest.approx(1e-3)
 
 
 def test_what_nobody_rests_on_is_not_fitted():

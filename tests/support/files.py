@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from clamber.model.se3 import matrix_from_rpy
 from clamber.model.terrain import AXES
 from clamber.recording.demonstration import Demonstration
 
@@ -292,3 +293,12 @@ def skin_markers(demo: Demonstration) -> tuple[list[str], np.ndarray]:
         out[f"{s}WRB"] = at[f"{s}Hand"] - 0.03 * left
         out[f"{s}FIN"] = at[f"{s}Hand.knuckle"] + [0, 0, 0.02]
     return list(out), np.stack(list(out.values()), axis=1)
+
+
+def box_obj(size, centre, yaw, first: int = 1, name: str | None = None) -> str:
+    """Eight vertices of an upright box in an order of no meaning."""
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, 8).T * size
+    v = corners @ matrix_from_rpy([0, 0, yaw]).T + centre
+    v = v[np.random.default_rng(first).permutation(8)]
+    lines = [] if name is None else [f"o {name}"]
+    return "\n".join([*lines, *(f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in v), ""])

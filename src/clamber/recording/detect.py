@@ -288,11 +288,11 @@ def _find_seats(tracks: _Tracks) -> list[list[tuple[int, int]]]:
         loose = over & (height < options.seat_height + options.height_slack)
         loose &= speed < leave
         strict = loose & (height < options.seat_height) & (speed < enter)
-        out.append(_hysteresis(strict, loose, options.min_duration * tracks.demo.rate))
+        out.append(hysteresis(strict, loose, options.min_duration * tracks.demo.rate))
     return out
 
 
-def _hysteresis(
+def hysteresis(
     strict: np.ndarray, loose: np.ndarray, shortest: float
 ) -> list[tuple[int, int]]:
     """Ranges [i, j), long enough, from `strict` until no longer `loose`.
@@ -348,7 +348,7 @@ def _part_intervals(
             strict[row] = loose[row] & (speed < options.enter_speed)
             strict[row] &= w.holds(n.height)
         either = _join(tracks, part, loose.any(axis=0))
-        for whole in _hysteresis(strict.any(axis=0), either, least):
+        for whole in hysteresis(strict.any(axis=0), either, least):
             for i, j in _places(tracks, points, strict, whole, least):
                 ends = {
                     leaving: [
@@ -453,17 +453,17 @@ def _refine(
     around = tracks.samples(_AROUND)
     ahead = min(i + tracks.samples(_SEARCH), (i + j) // 2)
     resting = support.height(raw)[ahead : min(ahead + tracks.samples(_REST), j)]
-    still = max(_STILL, 4.5 * _noise(raw) / 2.0)  # smoothing halves the noise
+    still = max(_STILL, 4.5 * noise_of(raw) / 2.0)  # smoothing halves the noise
     start = max(i - around, 0)
     # No part rests above its place.
     away = support.height(smooth)[start : ahead + 1] - np.median(resting) > still
     moving = np.flatnonzero(away)
     k = start + int(moving[-1]) if len(moving) else i
-    k = _fit_instant(raw, min(k, ahead), around)
+    k = fit_instant(raw, min(k, ahead), around)
     return float(demo.t[n - 1 - k if leaving else k])
 
 
-def _noise(x: np.ndarray) -> float:
+def noise_of(x: np.ndarray) -> float:
     """Standard deviation of white noise on a smooth track (T, 3) [m].
 
     Third differences of white noise have 20 times its variance; the median spares them
@@ -473,7 +473,7 @@ def _noise(x: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(jerk)) / np.sqrt(20.0))
 
 
-def _fit_instant(p: np.ndarray, k: int, half: int) -> int:
+def fit_instant(p: np.ndarray, k: int, half: int) -> int:
     """Index within `half` of k at which rest begins, by least squares.
 
     For each index c in question the track (N, 3) is a constant and a multiple of
