@@ -295,8 +295,7 @@ def test_a_plan_and_its_run_leave_the_files_of_the_format(
     wanted |= {"timings.json", "rollout.npz", "verdict.json"}
     assert wanted <= {p.name for p in (here / "made").iterdir()}
     seconds = json.loads((here / "made" / "timings.json").read_text())["seconds"]
-    assert seconds["simulate"] > 0
-    assert seconds["keyframes"] > 0
+    assert sum(seconds.values()) > seconds["simulate"] > 0
     cli.main(["simulate", "made", "--controller", "pid"])
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("the robot did not make it (")
@@ -343,7 +342,11 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
     assert quick_climb.drawing["with_video"] is True
     row = next(r for r in out.splitlines() if r.startswith("air -> LHand on box"))
     key = quick_climb.plan.keyframes[-1]
-    for value in (key.iterations, f"{key.cost_after:.3f}", f"{1e3 * key.com_margin:.0f}"):
+    for value in (
+        key.iterations,
+        f"{key.cost_after:.3f}",
+        f"{1e3 * key.com_margin:.0f}",
+    ):
         assert str(value) in row
     quick_climb.no_opengl = True  # a climb without pictures is a climb
     code = cli.main([*words, "--out", str(tmp_path / "b")])
