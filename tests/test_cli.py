@@ -16,11 +16,12 @@ import sys
 import termios
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args, get_type_hints
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -29,6 +30,7 @@ from clamber import cli
 from clamber.cli import commands, output
 from clamber.execution.verdict import Figure, judge
 from conftest import ROOT
+from support.files import write_take
 
 COLUMNS = 80
 CLAMBER = (sys.executable, "-m", "clamber")
@@ -76,7 +78,7 @@ def folder(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
         "unit.yaml": "file: a.npy\nrate: 120\nunit: ell\nnames: [LHand, RHand]\n",
         "cut/plan.json": (run / "plan.json").read_text()[:500],
         "half/plan.json": (run / "plan.json").read_text(),
-        "half/scene.xml": (run / "scene.xml").read_text(),
+        "half/planned.xml": (run / "planned.xml").read_text(),
         "empty/.keep": "",
     }.items():
         (folder / name).parent.mkdir(exist_ok=True)
@@ -276,6 +278,16 @@ def test_the_clock_adds_up_what_was_tried_again(monkeypatch: Patch):
     assert (clock.of("a"), clock.of("b"), clock.of("c")) == (4.0, 6.0, None)
 
 
+def test_contacts_says_by_how_much_the_floor_was_off(tmp_path: Path, capsys: Capture):
+    demo = clamber.load_demo("climb")
+    lifted = replace(demo, position=demo.position + np.array([0.0, 0.0, 0.035]))
+    write_take(lifted, tmp_path / "take.c3d")
+    out = ["--out", str(tmp_path / "out")]
+    words = ["contacts", str(tmp_path / "take.c3d"), "--fit-floor", *out]
+    notes = record_of(words, capsys)["notes"]
+    assert any(n.startswith("fitted: ground +35 mm (foot at rest") for n in notes)
+
+
 def test_a_plan_and_its_run_leave_the_files_of_the_format(
     here: Path, one_hand_plan, capsys: Capture
 ):
@@ -357,8 +369,6 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
 def test_a_plan_without_any_step_is_not_simulated(
     quick_climb: SimpleNamespace, tmp_path: Path, capsys: Capture
 ):
-    from dataclasses import replace
-
     quick_climb.plan = replace(quick_climb.plan, trajectory=None, complete=False)
     assert cli.main(["climb", "--height", "0.25", "--out", str(tmp_path / "a")]) == 1
     assert "simulate" not in quick_climb.calls
@@ -401,11 +411,11 @@ MISTAKES = {
     "contacts no.bvh": ("no.bvh: expected a readable file", "check the path"),
     "plan no.json": ("no.json: expected a readable file", "check the path"),
     "plan empty": ("empty/sequence.json", "`clamber contacts` writes it"),
-    "plan word.txt": ("word.txt: expected a whole JSON file", "check the path"),
+    "plan word.txt": ("word.txt: expected whole JSON", "check the path"),
     "replan empty --from 3": ("empty/plan.json", "`clamber plan` writes it"),
     "replan run --from 99": ("--from is", "expected a time of the rollout, 0 to"),
     "simulate nowhere": ("nowhere: expected a run folder", "`clamber climb`"),
-    "simulate cut": ("cut/plan.json: expected a whole JSON", "`clamber plan`"),
+    "simulate cut": ("cut/plan.json: expected whole JSON", "`clamber plan`"),
     "traverse no.json --scene scene.yaml": ("no.json", "check the path"),
     "traverse empty/policy.json --scene scene.yaml": ("policy.json", "`clamber learn`"),
     "learn": ("no demonstration", "name at least one, such as crossing"),
@@ -413,7 +423,7 @@ MISTAKES = {
     "learn crossing --out policy.txt": ("--out is 'policy.txt'", "ends in .json"),
     "render nowhere": ("nowhere: expected a run folder", "`clamber plan` makes one"),
     "render empty": ("empty/plan.json", "`clamber plan` writes it"),
-    "render half --video": ("half/trajectory.npz", "`clamber plan` writes it"),
+    "render half --video": ("half/planned.npz", "`clamber plan` writes it"),
     "render run --frame 999": ("--frame is 999.0", "expected a time from 0 to"),
     "render run --frame 1 --sheet": ("--sheet, --frame", "give one of them alone"),
     "render run --transparent": ("--transparent", "give --frame too, or leave it out"),
@@ -425,7 +435,7 @@ MISTAKES = {
     "report empty": ("a whole plan.json or verdict.json", "`clamber climb`"),
     "export run --to csv --rate 7": ("--rate is 7", "a divisor of 1000 Hz, as 50"),
     "export run --to csv --layout mjlab": ("--layout is", "it goes with --to npz"),
-    "export half --to csv": ("half/trajectory.npz", "`clamber plan` writes it"),
+    "export half --to csv": ("half/planned.npz", "`clamber plan` writes it"),
     "scene word.txt": ("word.txt is 'str'", "expected a mapping of fields"),
     "robot check nobody": ("'nobody'", "a robot.yaml, or one of coman, coman29"),
     "robot init no.urdf": ("no.urdf: expected a readable file", "check the path"),
