@@ -58,7 +58,16 @@ def _default(module: str, record: str, name: str) -> Any:
 
 Flat = tyro.conf.OmitArgPrefixes
 Printed = Annotated[Output, Flat]
-Place = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
+
+
+def _shown(metavar: str, default: str | None = None) -> Any:
+    """How a flag's value is called in help, and its default, where that is no value."""
+    hint = None if default is None else f"(default: {default})"
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
+
+
+Place = Annotated[Path | None, _shown("DIR")]
+RunFolder = Annotated[Path, tyro.conf.Positional, _shown("RUN")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +117,8 @@ class PlanningFlags:
         "planning.records", "PlanOptions", "method"
     )
     """How contact positions are optimised."""
-    speed: Annotated[float | Literal["max"], tyro.conf.arg(metavar="RAD/S|max")] = (
-        _default("planning.records", "PlanOptions", "speed")
+    speed: Annotated[float | Literal["max"], _shown("RAD/S|max")] = _default(
+        "planning.records", "PlanOptions", "speed"
     )
     """Largest joint speed; max: as fast as joints and contacts bear."""
 
@@ -188,7 +197,7 @@ def _scene(height: float | None, path: Path | None) -> clamber.Scene:
 class ClimbCommand:
     """The whole job: detect contacts, plan, simulate; all files in one run folder."""
 
-    demo: Annotated[str, tyro.conf.arg(metavar="RECORDING|NAME")] = "climb"
+    demo: Annotated[str, _shown("RECORDING|NAME")] = "climb"
     """A recording, or a built-in demonstration (climb, crossing)."""
     fit_floor: bool = False
     """Correct the heights of the recording's floor and boxes by what rests on them."""
@@ -243,9 +252,9 @@ class ClimbCommand:
 class ContactsCommand:
     """Find the contacts in a recording, at the person's scale: sequence.json."""
 
-    recording: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    recording: Annotated[str, tyro.conf.Positional, _shown("RECORDING")]
     """A recording, recording.yaml, or a built-in demonstration by name."""
-    scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    scene: Annotated[Path | None, _shown("FILE")] = None
     """The scene.yaml it was recorded in, where the recording has none."""
     fit_floor: bool = False
     """Correct the heights of floor and boxes by what rests on them."""
@@ -294,7 +303,7 @@ def _by_support(stance: clamber.Stance) -> dict[str, list[str]]:
 class PlanCommand:
     """Plan a contact sequence for a robot and a scene: plan, trajectory, scene.xml."""
 
-    sequence: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE")]
+    sequence: Annotated[Path, tyro.conf.Positional, _shown("SEQUENCE")]
     """A sequence.json."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
@@ -328,7 +337,7 @@ class ReplanCommand:
     With --from the rest of a run is planned from where the robot is.
     """
 
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SEQUENCE|RUN")]
+    source: Annotated[Path, tyro.conf.Positional, _shown("SEQUENCE|RUN")]
     """A sequence.json; with --from, the run folder whose plan was followed."""
     begin: Annotated[
         str | None,
@@ -422,9 +431,9 @@ class ReplanCommand:
 class TraverseCommand:
     """Cross a scene with a general policy: plan, then simulate."""
 
-    policy: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    policy: Annotated[Path, tyro.conf.Positional, _shown("POLICY")]
     """A policy.json, as `clamber learn` writes it."""
-    scene: Annotated[Path, tyro.conf.arg(metavar="FILE")]
+    scene: Annotated[Path, _shown("FILE")]
     """A scene.yaml."""
     robot: str = "coman"
     """A built-in robot by name, or a robot.yaml."""
@@ -478,9 +487,9 @@ class TraverseCommand:
 class SimulateCommand:
     """Run a plan in physics: rollout.npz, verdict.json."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_folder: RunFolder
     """A run folder that holds a plan."""
-    scene: Annotated[Path | None, tyro.conf.arg(metavar="TRUTH")] = None
+    scene: Annotated[Path | None, _shown("TRUTH")] = None
     """The scene.yaml that physics runs, where it is not the planned one."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     output: Printed
@@ -504,14 +513,12 @@ class LearnCommand:
     demonstrations: Annotated[
         tuple[str, ...],
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="RECORDING|SEQUENCE|NAME"),
+        _shown("RECORDING|SEQUENCE|NAME"),
     ]
     """Recordings, sequence.json files, or built-in demonstrations (crossing)."""
     out: Annotated[
         Path | None,
-        tyro.conf.arg(
-            metavar="FILE", help_behavior_hint="(default: runs/learn/policy.json)"
-        ),
+        _shown("FILE", "runs/learn/policy.json"),
     ] = None
     """The policy's file; pictures are written beside it."""
     output: Printed
@@ -568,13 +575,13 @@ def _sequence(name: str) -> clamber.ContactSequence:
 class RenderCommand:
     """Draw pictures and a video of a run, all of them or one."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_folder: RunFolder
     """A run folder that holds a plan."""
     video: bool = False
     """The video alone: MP4 with clamber[video], else an animated WebP."""
     sheet: bool = False
     """The sheet of keyframes alone."""
-    frame: Annotated[float | None, tyro.conf.arg(metavar="T")] = None
+    frame: Annotated[float | None, _shown("T")] = None
     """One picture alone, at that time [s]."""
     camera: Literal["corner", "side", "front", "behind", "top"] = "corner"
     """From where."""
@@ -582,14 +589,12 @@ class RenderCommand:
     """Robot and obstacles on nothing; with --frame."""
     size: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="1080p|WxH", help_behavior_hint="(default: frames 1080p)"
-        ),
+        _shown("1080p|WxH", "frames 1080p"),
     ] = None
     """Of the video, the frame, or each picture of the sheet."""
     out: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: in RUN)"),
+        _shown("FILE", "in RUN"),
     ] = None
     """The file."""
     output: Printed
@@ -670,13 +675,13 @@ def _picture_size(text: str) -> tuple[int, int]:
 class ReportCommand:
     """Write a run as one HTML file: an animation to turn and scrub, plots, tables."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_folder: RunFolder
     """A run folder, whole or not."""
-    compare: Annotated[Path | None, tyro.conf.arg(metavar="RUN2")] = None
+    compare: Annotated[Path | None, _shown("RUN2")] = None
     """Another run, laid beside it."""
     out: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: RUN/report.html)"),
+        _shown("FILE", "RUN/report.html"),
     ] = None
     """The file."""
     output: Printed
@@ -701,27 +706,21 @@ class ReportCommand:
 class ViewCommand:
     """Look at a run or a recording in the browser, step through it, edit a plan."""
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN|RECORDING")]
+    source: Annotated[str, tyro.conf.Positional, _shown("RUN|RECORDING")]
     """A run folder, whole or not; a recording, or a built-in demonstration by name."""
     demo: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="RECORDING|NAME", help_behavior_hint="(default: the run's own)"
-        ),
+        _shown("RECORDING|NAME", "the run's own"),
     ] = None
     """The recording that is shown beside a run."""
-    scene: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    scene: Annotated[Path | None, _shown("FILE")] = None
     """The scene.yaml of a recording that has none."""
     host: Annotated[
         str | None,
-        tyro.conf.arg(
-            metavar="ADDRESS", help_behavior_hint="(default: this machine alone)"
-        ),
+        _shown("ADDRESS", "this machine alone"),
     ] = None
     """Address to listen on; 0.0.0.0: every one of this machine."""
-    port: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 8080)")
-    ] = None
+    port: Annotated[int | None, _shown("N", "8080")] = None
     """Port, or the next one that is free."""
     output: Printed
 
@@ -772,35 +771,29 @@ class ViewCommand:
 class ExportCommand:
     """Write the motion of a run for other tools: CSV, MCAP (ROS 2), npz (trainers)."""
 
-    run_folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    run_folder: RunFolder
     """A run folder that holds a plan."""
     to: Literal["csv", "mcap", "npz"]
     """The format."""
     rate: Annotated[
         int | None,
-        tyro.conf.arg(
-            metavar="HZ", help_behavior_hint="(default: 100; npz 50; at most 1000)"
-        ),
+        _shown("HZ", "100; npz 50; at most 1000"),
     ] = None
     """Samples per second, a divisor of 1000."""
-    lead_in: Annotated[str | None, tyro.conf.arg(metavar="FILE|home")] = None
+    lead_in: Annotated[str | None, _shown("FILE|home")] = None
     """Measured joint angles [rad] by name (YAML or JSON), to start from."""
-    lead_in_speed: Annotated[float, tyro.conf.arg(metavar="RAD/S")] = field(
+    lead_in_speed: Annotated[float, _shown("RAD/S")] = field(
         default_factory=lambda: import_module("clamber.run.lead_in").SPEED
     )
     """Largest joint speed on the way from there to the first posture."""
     layout: Annotated[
         Literal["mjlab", "holosoma"] | None,
-        tyro.conf.arg(
-            metavar="mjlab|holosoma", help_behavior_hint="(default: mjlab; npz alone)"
-        ),
+        _shown("mjlab|holosoma", "mjlab; npz alone"),
     ] = None
     """Whose joint_pos and joint_vel an npz holds."""
     out: Annotated[
         Path | None,
-        tyro.conf.arg(
-            metavar="FILE", help_behavior_hint="(default: RUN/motion.FORMAT)"
-        ),
+        _shown("FILE", "RUN/motion.FORMAT"),
     ] = None
     """The file."""
     output: Printed
@@ -831,11 +824,11 @@ class ExportCommand:
 class SceneCommand:
     """Check a scene, say what is in it and, with --out, draw it."""
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    file: Annotated[Path, tyro.conf.Positional, _shown("FILE")]
     """A scene.yaml, or boxes as OBJ or MJCF."""
     robot: str = "coman"
     """Who stands at its start: a built-in robot by name, or a robot.yaml."""
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    out: Annotated[Path | None, _shown("DIR")] = None
     """Where to write the picture scene.png."""
     output: Printed
 
@@ -878,13 +871,13 @@ class RobotCommand:
 
     action: tyro.conf.Positional[Literal["init", "check"]]
     """init: from an MJCF or URDF. check: a robot.yaml."""
-    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
+    model: Annotated[str, tyro.conf.Positional, _shown("MODEL")]
     """init: an MJCF or URDF file. check: a robot.yaml, or a built-in robot by name."""
-    effort: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    effort: Annotated[Path | None, _shown("FILE")] = None
     """init: effort limits the model lacks: YAML {joint: N m}, or another model."""
     out: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="DIR", help_behavior_hint="(default: init: robots/NAME)"),
+        _shown("DIR", "init: robots/NAME"),
     ] = None
     """Where to write robot.yaml and robot.xml (init), and the picture robot.png."""
     output: Printed
@@ -950,14 +943,14 @@ class RobotCommand:
 class SweepCommand:
     """Many climbs, by a spec: one row a run, success against each factor."""
 
-    spec: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SPEC")]
+    spec: Annotated[Path, tyro.conf.Positional, _shown("SPEC")]
     """A spec.yaml: what all runs share, and a grid, a random sample or a search."""
     workers: Annotated[
         int | None,
-        tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)"),
+        _shown("N", "one a core"),
     ] = None
     """Processes that do the runs."""
-    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    scheduler: Annotated[str | None, _shown("ADDRESS")] = None
     """A dask scheduler, whose workers do the runs instead."""
     out: Place = None
     """The sweep's folder (runs/<name of the spec>); it is gone on with if it exists."""
