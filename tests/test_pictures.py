@@ -22,7 +22,7 @@ from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.run import folder as io
 from clamber.show import pictures, renderer
-from clamber.show.sample import thinned
+from clamber.show.sample import force_by_contact, thinned
 
 SIZE = (160, 120)
 
@@ -112,8 +112,8 @@ def test_the_near_edge_is_the_one_before_the_start():
 
 def test_a_caption_gives_the_figures_of_the_keyframe(plan: Plan):
     first, last = plan.keyframes[0], plan.keyframes[-1]
-    title, geometry, balance = pictures.keyframe_caption(1, last, first)
-    assert title == "1  LHand on box"
+    title, geometry, balance = pictures.keyframe_caption(1, last, plan.changes[0].step)
+    assert title == "1  air -> LHand on box"
     d = next(c for c in last.contacts if c.contact.surface == "LHand")
     assert f"d LHand {1000 * d.projected_distance:.0f} mm" in geometry
     assert f"CoM margin {1000 * last.com_margin:.0f} mm" in geometry
@@ -124,7 +124,7 @@ def test_a_caption_gives_the_figures_of_the_keyframe(plan: Plan):
 
 def test_forces_of_the_contacts_carry_the_weight(plan: Plan):
     for key in plan.keyframes:
-        total = np.sum(pictures._force_by_contact(plan.world, key), axis=0)
+        total = np.sum(list(force_by_contact(plan.world, key).values()), axis=0)
         weight = [0.0, 0.0, plan.world.mass * 9.81]
         np.testing.assert_allclose(total, weight, atol=0.5)
 

@@ -189,7 +189,7 @@ def test_a_plan_alone_is_animated_without_forces(planned: Path):
     assert record["motion"]["loads"] is None
     assert np.isfinite(series(record, "margin")).all()
     assert record["criteria"] is None
-    assert [k["move"] for k in record["keyframes"]][1] == "LHand on box"
+    assert [k["move"] for k in record["keyframes"]][1] == "air -> LHand on box"
 
 
 def test_a_plan_that_got_no_trajectory_shows_its_keyframes(plan: Plan, tmp_path: Path):

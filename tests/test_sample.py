@@ -11,7 +11,6 @@ from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
 from clamber.show import sample
-from conftest import contact
 
 
 @pytest.fixture(scope="module")
@@ -22,21 +21,6 @@ def plan(one_hand_plan: Plan) -> Plan:
 @pytest.fixture(scope="module")
 def rollout(one_hand_rollout: Rollout) -> Rollout:
     return one_hand_rollout
-
-
-def test_moves_are_described_by_what_changed():
-    feet = [contact("LFoot", "ground", 0, 0, 0), contact("RFoot", "ground", 0, 0, 0)]
-    hand = contact("LHand", "box", 0.4, 0.1, 0.2)
-    elbow = contact("LElbow", "box", 0.4, 0.1, 0.2)
-    moved = replace(hand, position=np.array([0.5, 0.1, 0.2]))
-    assert sample.describe_change(feet, [*feet, hand]) == "LHand on box"
-    assert (
-        sample.describe_change([*feet, hand], [*feet, elbow])
-        == "LElbow on box for LHand"
-    )
-    assert sample.describe_change([*feet, hand], [*feet, moved]) == "LHand on box"
-    assert sample.describe_change([*feet, hand], feet) == "LHand in the air"
-    assert sample.describe_change(feet, feet) == "no change"
 
 
 # Series.

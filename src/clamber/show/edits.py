@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
-from clamber.contact.steps import Step, same_place
+from clamber.contact.steps import same_place
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
 from clamber.model.scene import Support
@@ -78,9 +78,9 @@ def intervals_of(made: Plan) -> tuple[Interval, ...]:
     """The contacts of a plan's sequence that can be moved: those made on the way."""
     sequence = made.sequence
     planned = {
-        (step.stance, step.makes.surface): made.keyframes[i]
-        for i, step in keyframe_steps(made)
-        if step.makes is not None
+        (c.step.stance, c.step.makes.surface): c.keyframe
+        for c in made.changes
+        if c.step.index is not None and c.step.makes is not None
     }
     out = []
     for surface in made.world.surfaces:
@@ -106,12 +106,6 @@ def intervals_of(made: Plan) -> tuple[Interval, ...]:
                 )
             i = j
     return tuple(sorted(out, key=lambda s: s.first))
-
-
-def keyframe_steps(made: Plan) -> list[tuple[int, Step]]:
-    """Index of each keyframe that a step of the sequence leads to, and that step."""
-    steps = [(i, c.step) for i, c in enumerate(made.changes, start=1)]
-    return [(i, step) for i, step in steps if step.index is not None]
 
 
 def clamped(support: Support, point: np.ndarray) -> np.ndarray:
@@ -218,11 +212,11 @@ def paired_times(
     """
     t = plan.sequence.t
     robot, person = [0.0], [float(t[0])]
-    for i, step in keyframe_steps(plan):
-        at = reached[i]
-        if at is not None and at > robot[-1]:
+    for change, at in zip(plan.changes, reached[1:], strict=True):
+        known = change.step.index is not None and at is not None
+        if known and at > robot[-1]:
             robot.append(at)
-            person.append(float(t[step.stance]))
+            person.append(float(t[change.step.stance]))
     if end > robot[-1]:
         robot.append(end)
         person.append(float(t[-1]))

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from clamber.contact.contact import ContactSequence
+from clamber.contact.steps import Step
 from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
@@ -48,8 +49,6 @@ from clamber.show.renderer import (
     view_of,
 )
 from clamber.show.sample import (
-    changed,
-    describe_change,
     force_by_contact,
     row_at,
     sample_motion,
@@ -143,24 +142,21 @@ def keyframe_sheet(
     """
     world = plan.world
     view = view_of(world, [k.q for k in plan.keyframes], tile[0] / tile[1], camera)
-    tiles = []
+    tiles, steps = [], [None, *(c.step for c in plan.changes)]
     with Camera(world, tile) as drawing:
         for i, key in enumerate(plan.keyframes):
             picture = drawing.shot(key.q, view)
             mark_keyframe(picture, view, world, key)
-            before = plan.keyframes[i - 1] if i else None
-            tiles.append((picture, keyframe_caption(i, key, before)))
+            tiles.append((picture, keyframe_caption(i, key, steps[i])))
     return _save_sheet(tiles, path, columns=min(4, len(tiles)))
 
 
-def keyframe_caption(i: int, key: Keyframe, before: Keyframe | None) -> list[str]:
-    """Three lines: the move, geometry and balance, forces."""
-    if before is None:
-        title = "start, on " + ", ".join(c.surface for c in key.stance)
-        new = {c.surface for c in key.stance}
-    else:
-        title = describe_change(before.stance, key.stance)
-        new = {c.surface for c in changed(before.stance, key.stance)[0]}
+def keyframe_caption(i: int, key: Keyframe, step: Step | None) -> list[str]:
+    """Three lines: the step that led there, geometry and balance, forces."""
+    new = {c.surface for c in key.stance}
+    title = "start, on " + ", ".join(c.surface for c in key.stance)
+    if step is not None:
+        title, new = str(step), {step.makes.surface} if step.makes else set()
     d = ", ".join(
         f"d {c.contact.surface} {1000 * c.projected_distance:.0f} mm"
         for c in key.contacts

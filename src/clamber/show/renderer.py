@@ -17,7 +17,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,7 +31,7 @@ from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World
 from clamber.planning.records import Plan
 from clamber.run.codec import whole_file
-from clamber.show.sample import describe_change, thinned
+from clamber.show.sample import thinned
 
 Preset = Literal["corner", "side", "front", "behind", "top"]
 FROM_ABOVE = -70.0  # [deg] elevation from which the camera's light whitens the ground
@@ -443,7 +442,7 @@ def _frames(
     speedup = speedup_of(duration)
     times = np.arange(0.0, duration, speedup / fps)
     rows = np.searchsorted(rollout.time, times)
-    moves = [describe_change(a.stance, b.stance) for a, b in pairwise(plan.keyframes)]
+    moves = [str(c.step) for c in plan.changes]
     starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
     drawn = (
         size[0] * 5 // 4,

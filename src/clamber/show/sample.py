@@ -9,7 +9,7 @@ Shapes: n samples, nq coordinates, nS surfaces, na joints, M recorded states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.contact.steps import Step
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
@@ -52,7 +53,6 @@ SAME_POSTURE = 1e-3  # [rad]
 SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
 LOADED = 0.01  # [weights] a surface that bears more is loaded
 TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
-MOVED = 0.01  # [m] a contact that is farther from where it was has been made anew
 _Loaded = TypeVar("_Loaded")
 
 
@@ -159,29 +159,6 @@ def read_run(folder: Path) -> Run:
 # Stances.
 
 
-def changed(
-    before: Sequence[Contact], after: Sequence[Contact]
-) -> tuple[list[Contact], list[str]]:
-    """Contacts that a stance makes anew, and surfaces that leave theirs."""
-    was = {c.surface: c.position for c in before}
-    made = [
-        c
-        for c in after
-        if c.surface not in was or np.linalg.norm(c.position - was[c.surface]) > MOVED
-    ]
-    now = {c.surface for c in after}
-    return made, [s for s in was if s not in now]
-
-
-def describe_change(before: Sequence[Contact], after: Sequence[Contact]) -> str:
-    """What changed between two stances, such as `LElbow on box for LHand`."""
-    made, broken = changed(before, after)
-    if made:
-        text = ", ".join(f"{c.surface} on {c.support}" for c in made)
-        return f"{text} for {', '.join(broken)}" if broken else text
-    return f"{', '.join(broken)} in the air" if broken else "no change"
-
-
 def stance_rows(
     written: Mapping[str, Any], times: list[float | None]
 ) -> list[dict[str, Any]]:
@@ -191,20 +168,12 @@ def stance_rows(
         written: Fields of `plan.json`, or none.
         times: When each keyframe is reached [s].
     """
-    rows, before = [], None
-    for key, time in zip(written.get("keyframes", []), times, strict=True):
-        stance = [
-            Contact(
-                surface=c["surface"],
-                support=c["support"],
-                position=np.array(c["position"]),
-                quaternion=np.array(c["quaternion"]),
-            )
-            for c in key["contacts"]
-        ]
-        on = ", ".join(c.surface for c in stance)
-        move = f"start, on {on}" if before is None else describe_change(before, stance)
-        before = stance
+    keys, rows = written.get("keyframes", []), []
+    if not keys:
+        return []
+    on = ", ".join(c["surface"] for c in keys[0]["contacts"])
+    moves = [f"start, on {on}", *(_named(c["step"]) for c in written["changes"])]
+    for key, time, move in zip(keys, times, moves, strict=True):
         e = key["static_equilibrium"]
         force = _force_by_surface(e)
         rows.append(
@@ -229,6 +198,15 @@ def stance_rows(
             }
         )
     return rows
+
+
+def _named(step: Mapping[str, Any]) -> str:
+    """A step of `plan.json` in words, as `Step` has them."""
+    makes = None
+    if step["makes"] is not None:
+        names = {k: step["makes"][k] for k in ("surface", "support")}
+        makes = Contact(**names, position=np.zeros(3), quaternion=np.eye(4)[0])
+    return str(Step(limb=step["limb"], breaks=tuple(step["breaks"]), makes=makes))
 
 
 def _force_by_surface(equilibrium: Mapping[str, Any]) -> dict[str, list[float]]:

@@ -23,7 +23,6 @@ from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.page import paragraphs
 from clamber.show.pictures import FORCE_LENGTH, PHASE_COLOURS
 from clamber.show.sample import (
-    describe_change,
     force_by_contact,
     keyframe_times,
     posture_at,
@@ -138,10 +137,7 @@ class Stage:
         """
         self.motion = m = sample_motion(plan, rollout, {})
         self.reached = keyframe_times(plan, rollout)
-        self.changes = ["start"] + [
-            describe_change(a.stance, b.stance)
-            for a, b in zip(plan.keyframes, plan.keyframes[1:], strict=False)
-        ]
+        self.changes = ["start", *(str(c.step) for c in plan.changes)]
         self._forces = [force_by_contact(plan.world, k) for k in plan.keyframes]
         self._kin = Kinematics(m.world)
         self._weight = m.world.mass * 9.81
