@@ -20,7 +20,7 @@ from clamber.planning.records import Plan
 from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
-from clamber.run.folder import PLAN, SEQUENCE, load_sequence
+from clamber.run.folder import PLAN, SEQUENCE, fallback_note, load_sequence
 from clamber.show.editor import Editor
 from clamber.show.edits import paired_times
 from clamber.show.page import Page
@@ -107,7 +107,7 @@ def _open_run(
             if sequence is None or sequence.subject is None:
                 sequence = reading.attempt(lambda: detect_contacts(recorded))
             skeleton = skeleton_of(recorded, sequence)
-    notes = (run.written.get("instead", ""), run.execution.get("stopped", ""))
+    notes = (fallback_note(run.written), run.execution.get("stopped", ""))
     page = Page(host, port, folder.resolve().name, run.missing, notes)
     if run.plan is not None:
         _RunPage(page, run, run.plan, skeleton)

@@ -203,7 +203,7 @@ def stance_rows(
 def _named(step: Mapping[str, Any]) -> str:
     """A step of `plan.json` in words, as `Step` has them."""
     makes = None
-    if step["makes"] is not None:
+    if step.get("makes") is not None:
         names = {k: step["makes"][k] for k in ("surface", "support")}
         makes = Contact(**names, position=np.zeros(3), quaternion=np.eye(4)[0])
     return str(Step(limb=step["limb"], breaks=tuple(step["breaks"]), makes=makes))
