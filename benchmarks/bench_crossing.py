@@ -79,7 +79,7 @@ def cross(
     out |= {
         **{"planned": plan.complete, "changes": changes},
         "plan_s_per_change": f"{spent / max(changes, 1):.3f}",
-        "why": "; ".join(s.reason for s in plan.skipped),
+        "why": plan.why_not,
     }
     if not (physics and plan.complete):
         return out

@@ -61,7 +61,7 @@ def measure(policy: Path, length: float) -> Row:
         "planned_mb": memory[1],
         "saved_mb": peak(),
         "complete": plan.complete,
-        "why": "; ".join(s.reason for s in plan.skipped),
+        "why": plan.why_not,
     }
 
 

@@ -255,7 +255,7 @@ def test_a_descent_is_the_ascent_reversed_and_stands_up_at_its_end(gait):
     back = on_fours(gait, 0.83 - gait.build.behind, math.pi)
     up, down = proposed(gait, back, refused=lambda c: False)
     assert (up.accept, wanted(up)) == ("never", (*HANDS, *ELBOWS, *KNEES))
-    ankles = gait.ankles(Frame(edge.point - gait.build.stand * edge.inward, math.pi))
+    ankles = gait.ankles(Frame.behind(edge, -gait.build.stand))
     np.testing.assert_allclose(up.start, ankles)
     # Feet take the place of knees, hands that of elbows; then the hands let go.
     assert wanted(down) == ("RFoot", "LFoot", *HANDS[::-1], "-", "-")

@@ -64,7 +64,8 @@ class Climber:
             self.set(s, support, np.array([x, STEPS.sides[s], z]), edge)
 
     def next(self) -> dict[str, tuple[Contact, ...]]:
-        return dict(self.flight.next_contacts(tuple(self.stance.values())))
+        found = self.flight.next_contacts(tuple(self.stance.values()))
+        return {places[0].surface: places for places in found}
 
     def x(self, p: np.ndarray) -> float:
         return self.platform.entry.distance(p)

@@ -24,8 +24,7 @@ from typing import Literal
 import numpy as np
 
 from clamber.contact.contact import PARTS, Region, Stance
-from clamber.contact.scaling import near_edge
-from clamber.model.scene import Scene, Support
+from clamber.model.scene import Edge, Scene, Support
 from clamber.model.se3 import wrap
 
 Place = Literal["G", "M", "O", "goal"]
@@ -230,28 +229,6 @@ def pelvis_rotation(angles: np.ndarray) -> np.ndarray:
     )
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Edge:
-    """A line along which an obstacle is climbed.
-
-    Attributes:
-        point: (2,) on the line, in the world [m].
-        inward: (2,) horizontal unit normal into the obstacle.
-    """
-
-    point: np.ndarray
-    inward: np.ndarray
-
-    def distance(self, p: np.ndarray) -> float:
-        """How far a world point (3,) is behind the line [m]; negative before it."""
-        return float((p[:2] - self.point) @ self.inward)
-
-    @property
-    def yaw(self) -> float:
-        """Of the edge frame in the world [rad]."""
-        return math.atan2(self.inward[1], self.inward[0])
-
-
 def climbed_edges(
     support: Support, start: np.ndarray, goal: np.ndarray
 ) -> tuple[Edge, ...]:
@@ -263,10 +240,7 @@ def climbed_edges(
         goal: Where it ends; over the top itself, nothing is climbed down.
     """
     ends = [start] if _over(support, goal) else [start, goal]
-    frames = [near_edge(support, np.asarray(p)[:2]) for p in ends]
-    return tuple(
-        Edge(point=f.origin[:2], inward=f.rotation[:2, 0].copy()) for f in frames
-    )
+    return tuple(support.edge_towards(np.asarray(p)) for p in ends)
 
 
 def _over(support: Support, p: np.ndarray) -> bool:

@@ -23,7 +23,6 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.contact.policy import (
-    Edge,
     GeneralPolicy,
     Option,
     pelvis_angles,
@@ -33,7 +32,7 @@ from clamber.contact.policy import (
 from clamber.contact.steps import Seeds, Step
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics
-from clamber.model.scene import GROUND
+from clamber.model.scene import GROUND, Edge
 from clamber.model.se3 import matrix_from_quat, turn_about_z
 from clamber.model.world import World
 from clamber.planning.gaps import due_near_gap, gaps_ahead
@@ -184,7 +183,7 @@ class Gait:
                 return True
             yield self._walk(at, frame, wanted)
             return False
-        wanted = self._before(ahead.entry)
+        wanted = Frame.behind(ahead.entry, -self.build.stand)
         off = wanted.local(frame.xy)
         if (
             abs(off[0]) <= STAND_TOLERANCE * self.build.stand / STAND
@@ -203,10 +202,6 @@ class Gait:
         ways = np.sum([matrix_from_quat(c.quaternion)[:2, 0] for c in feet], axis=0)
         middle = np.mean([c.position[:2] for c in feet], axis=0)
         return Frame(middle, float(np.arctan2(ways[1], ways[0])))
-
-    def _before(self, edge: Edge) -> Frame:
-        """Where the feet stand before an edge."""
-        return Frame(edge.point - self.build.stand * edge.inward, edge.yaw)
 
     def _walk(self, at: Outcome, frame: Frame, wanted: Frame) -> Proposal:
         """One step of each foot towards where it shall stand."""
@@ -240,7 +235,7 @@ class Gait:
 
     def _next_treads(
         self, at: Outcome, platform: Platform
-    ) -> list[tuple[str, tuple[Contact, ...]]]:
+    ) -> list[tuple[Contact, ...]]:
         """What goes up a flight of stairs next; empty where it is none, or is up."""
         flight = Flight(self.world, platform, self.goal, self.build.stairs)
         return flight.next_contacts(at.stance) if flight.is_climbable() else []
@@ -253,16 +248,16 @@ class Gait:
             return
         # Where not all of a pair get to their places, all go to their next best.
         some, options = None, self.policy.options
-        for rank in range(max(len(places) for _, places in wanted)):
+        for rank in range(max(map(len, wanted))):
             goals = []
-            for surface, places in wanted:
-                moving = (o.name for o in options if surface in o.surfaces)
-                place = places[min(rank, len(places) - 1)]
-                goals.append(Goal(next(moving, options[-1].name), (place,)))
+            for places in wanted:
+                to = places[min(rank, len(places) - 1)]
+                moving = (o.name for o in options if to.surface in o.surfaces)
+                goals.append(Goal(next(moving, options[-1].name), (to,)))
             tried = yield Proposal(
                 after=at,
                 goals=goals,
-                body=Frame(platform.entry.point, platform.entry.yaw),
+                body=Frame.behind(platform.entry),
                 rounds=FREELY * 2,
                 posture="upright",
             )
@@ -295,8 +290,7 @@ class Gait:
                 if option.region == "O" and limb.is_arm and limb.name in on:
                     continue
                 offset = self.build.mount(limb, surface)
-                body = Frame(edge.point, edge.yaw)
-                contact = self.place(platform, surface, body, offset)
+                contact = self.place(platform, surface, Frame.behind(edge), offset)
                 breaks = () if limb.is_arm else limb.surfaces[:1]
                 if limb.name in on:
                     breaks = (on[limb.name],)
@@ -314,7 +308,7 @@ class Gait:
         """
         edge = platform.exit
         assert edge is not None
-        ankles = self.ankles(self._before(edge))
+        ankles = self.ankles(Frame.behind(edge, -self.build.stand))
         ascent = self._ascent(edge, platform)
         up = yield Climb(steps=ascent, start=ankles, accept="never")
         if up.failure:
@@ -356,7 +350,7 @@ class Gait:
             yield from self._crawl(at, platform, frame, wanted)
             return False
         # It faces inwards, and climbs down backwards.
-        wanted = Frame(edge.point + self.build.behind * edge.inward, edge.yaw)
+        wanted = Frame.behind(edge, self.build.behind)
         if not frame.is_at(wanted):
             yield from self._crawl(at, platform, frame, wanted)
             if frame.away(wanted) > NEARLY:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from clamber.contact.contact import Contact
-from clamber.contact.policy import Edge
 from clamber.errors import InputError
-from clamber.model.scene import GROUND_HALF_SIZE, Scene, Support
+from clamber.model.scene import GROUND_HALF_SIZE, Edge, Scene, Support
 from clamber.model.se3 import quat_from_matrix, turn_about_z
 
 GAP = 0.40  # [m] a narrower gap is crossed on top, a wider one on the ground
@@ -66,6 +65,11 @@ class Frame:
 
     xy: np.ndarray
     yaw: float
+
+    @classmethod
+    def behind(cls, edge: Edge, distance: float = 0.0) -> Frame:
+        """Facing inwards, so far behind an edge [m]; negative: before it."""
+        return cls(edge.point[:2] + distance * edge.inward, edge.yaw)
 
     def at(self, offset: np.ndarray) -> np.ndarray:
         """(2,) in the world of a point of the frame."""
@@ -194,7 +198,8 @@ def _gate(top: Support, start: np.ndarray, goal: np.ndarray, share: float) -> Ed
     along = (second - first) / length
     beside = min(BESIDE, length / 2)
     s = float(np.clip((p - first) @ along, beside, length - beside))
-    return Edge(point=first + s * along, inward=-A[i])
+    p = first + s * along
+    return Edge(point=np.array([*p, top.level(p)]), inward=-A[i])
 
 
 def contact_at(surface: str, top: Support, point: np.ndarray, yaw: float) -> Contact:

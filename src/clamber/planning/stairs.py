@@ -74,10 +74,8 @@ class Flight:
                     return False
         return True
 
-    def next_contacts(
-        self, stance: Sequence[Contact]
-    ) -> list[tuple[str, tuple[Contact, ...]]]:
-        """The next surfaces to be set down, each with its places, the best one first.
+    def next_contacts(self, stance: Sequence[Contact]) -> list[tuple[Contact, ...]]:
+        """The next contacts to be made, each at its places, the best one first.
 
         Read off the stance alone, on the ground and the treads or on some of them:
         limbs without a contact; else both hands, where the feet have come after them;
@@ -102,11 +100,11 @@ class Flight:
             to = tread.near(ahead)
             held = arm.name in at and at[arm.name].surface == hand
             if not held or (on == legs and to - x[arm.name] >= WORTH):
-                hands.append((hand, (self._contact(hand, tread.name, to),)))
+                hands.append((self._contact(hand, tread.name, to),))
         lost = [b.surfaces[0] for b in legs if b.name not in at]
         if lost:
             other = on[0].name
-            return [(s, (self._contact(s, at[other].support, x[other]),)) for s in lost]
+            return [(self._contact(s, at[other].support, x[other]),) for s in lost]
         if hands:
             return hands
         feet = []
@@ -121,13 +119,11 @@ class Flight:
                 if to - x[leg.name] >= WORTH
             )
             if places:
-                feet.append((foot, places))
+                feet.append(places)
         if feet:
             return feet
         knees = [(b.surfaces[-1], self._treads(b.surfaces[-1])[-1]) for b in on]
-        return [
-            (k, (self._contact(k, t.name, t.near(self._end(t))),)) for k, t in knees
-        ]
+        return [(self._contact(k, t.name, t.near(self._end(t))),) for k, t in knees]
 
     def _end(self, last: _Tread) -> float:
         """Where the knees come on the last tread: around the goal, if it is near."""
@@ -144,8 +140,8 @@ class Flight:
         """
         edge = self.platform.entry
         left = np.array([-edge.inward[1], edge.inward[0]])
-        way = (self.goal - edge.point) / edge.distance(self.goal)
-        return edge.point + self.steps.sides[surface] * left, way
+        way = (self.goal - edge.point[:2]) / edge.distance(self.goal)
+        return edge.point[:2] + self.steps.sides[surface] * left, way
 
     def _contact(self, surface: str, support: str, x: float) -> Contact:
         origin, way = self._line(surface)
