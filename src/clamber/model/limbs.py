@@ -214,14 +214,14 @@ class Tree:
 
     def far(self, chain: Chain, data: mujoco.MjData | None = None) -> np.ndarray:
         """(3,) middle of a limb's end, away from its knee or elbow."""
-        data = data or self.data
-        points = self.points(int(self.links[chain.end]), below=True, data=data)
-        return points.mean(axis=0) if len(points) else data.xipos[chain.end]
+        here = self.data if data is None else data
+        points = self.points(int(self.links[chain.end]), below=True, data=here)
+        return points.mean(axis=0) if len(points) else here.xipos[chain.end]
 
     def in_link(
         self, link: int, p: np.ndarray, R: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A pose in the world at the zero posture as one in a link."""
+        """A pose in the world, at the zero posture, as one in a link."""
         R_WL = self.data.xmat[link].reshape(3, 3)
         return R_WL.T @ (p - self.data.xpos[link]), R_WL.T @ R.reshape(3, 3)
 

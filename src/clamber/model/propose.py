@@ -466,9 +466,8 @@ def _hand_load(
     out = np.inf
     for side, chain in zip("LR", found.pair("arm"), strict=True):
         ball = balls[f"{side}Hand"]
-        p = data.xpos[ball.link] + data.xmat[ball.link].reshape(3, 3) @ ball.position
         for j in chain.joints[chain.bend + 1 :]:
-            arm = np.cross(data.xaxis[j], p - data.xanchor[j])
+            arm = np.cross(data.xaxis[j], ball.position - data.xanchor[j])
             lever = max(float(np.linalg.norm(arm)), ball.size[0])
             out = min(out, effort[tree.name(j)] / lever)
     return float(out)

@@ -34,7 +34,7 @@ from clamber.model.limbs import (
     geom_volume,
 )
 from clamber.model.records import short_repr
-from clamber.model.se3 import matrix_from_quat, quat_from_matrix
+from clamber.model.se3 import quat_from_matrix
 
 HEAVY = 1.0  # [kg] a link this heavy without collision shape gets one
 PAD = 0.006  # [m] balls stand out of their links: the link does not touch before them
@@ -64,14 +64,14 @@ _SPHERE, _BOX = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_BOX
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Shape:
-    """A collision shape in the frame of its link.
+    """A collision shape of a link, where it is at the zero posture.
 
     Attributes:
         name: Of the geom.
         link: First body of the link.
         kind: Of the geom.
         size: As MuJoCo has it.
-        position: (3,); quaternion: (4,).
+        position: (3,) in the world; rotation: (3, 3).
         surface: It is part of a contact surface.
     """
 
@@ -80,9 +80,7 @@ class Shape:
     kind: mujoco.mjtGeom
     size: tuple[float, ...]
     position: np.ndarray
-    quaternion: np.ndarray = field(
-        default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0])
-    )
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     surface: bool = False
 
     __repr__ = short_repr
@@ -100,7 +98,7 @@ def link_shapes(tree: Tree) -> tuple[list[Shape], list[str]]:
         seen = sum(geom_volume(model, g) for g in geoms if g not in solid)
         if (solid or mass >= HEAVY) and mass > DENSEST * bulk and seen > bulk:
             points = np.concatenate([geom_points(model, data, g) for g in geoms])
-            shapes.append(_around(tree, f"link_{body}_0", link, points))
+            shapes.append(_around(f"link_{body}_0", link, points))
             thin.append(body)
             continue
         for g in solid:
@@ -109,10 +107,10 @@ def link_shapes(tree: Tree) -> tuple[list[Shape], list[str]]:
             if kind in _KINDS:
                 size = model.geom_size[g, : _KINDS[kind]]
                 pose = data.geom_xpos[g], data.geom_xmat[g]
-                shapes.append(_shape(tree, name, link, kind, size, *pose))
+                shapes.append(_shape(name, link, kind, size, *pose))
             elif kind == mujoco.mjtGeom.mjGEOM_MESH:
                 points = geom_points(model, data, g)
-                shapes.append(_around(tree, name, link, points))
+                shapes.append(_around(name, link, points))
         if not solid and mass >= HEAVY:
             shapes.append(_of_inertia(tree, f"link_{body}_0", link))
             notes.append(f"{body} has no geometry: a box of its inertia is taken")
@@ -125,27 +123,24 @@ def link_shapes(tree: Tree) -> tuple[list[Shape], list[str]]:
 
 
 def _shape(
-    tree: Tree,
     name: str,
     link: int,
     kind: mujoco.mjtGeom,
     size: Sequence[float] | np.ndarray,
-    p: np.ndarray,
-    R: np.ndarray,
+    position: np.ndarray,
+    rotation: np.ndarray,
 ) -> Shape:
-    """Of a pose in the world."""
-    p, R = tree.in_link(link, p, R)
     return Shape(
         name=name,
         link=link,
         kind=kind,
         size=tuple(float(x) for x in size),
-        position=p,
-        quaternion=quat_from_matrix(R),
+        position=position.copy(),
+        rotation=rotation.reshape(3, 3).copy(),
     )
 
 
-def _around(tree: Tree, name: str, link: int, points: np.ndarray) -> Shape:
+def _around(name: str, link: int, points: np.ndarray) -> Shape:
     """The capsule as long as the hull of points (K, 3) and of its volume.
 
     What is flat becomes the box around it instead, along the same principal axes.
@@ -165,16 +160,16 @@ def _around(tree: Tree, name: str, link: int, points: np.ndarray) -> Shape:
     R[:, 2] = np.cross(R[:, 0], R[:, 1])
     a, b, c = half[order]
     if c < FLAT * b:
-        return _shape(tree, name, link, _BOX, (a, b, c), centre, R)
+        return _shape(name, link, _BOX, (a, b, c), centre, R)
     # Half length a and radius r hold pi r^2 (2 (a - r) + 4/3 r), growing up to r = a.
     r = float(np.sqrt(b * c))
     if np.isfinite(volume) and volume < 4 / 3 * np.pi * a**3:
         r = _root(lambda r: np.pi * r**2 * (2 * a - 2 / 3 * r) - volume, 0.0, a)
     R = np.stack([R[:, 1], R[:, 2], R[:, 0]], axis=1)
     if a - r < 1e-3:
-        return _shape(tree, name, link, _SPHERE, (r,), centre, R)
+        return _shape(name, link, _SPHERE, (r,), centre, R)
     kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-    return _shape(tree, name, link, kind, (r, a - r), centre, R)
+    return _shape(name, link, kind, (r, a - r), centre, R)
 
 
 def _root(f: Callable[[float], float], low: float, high: float) -> float:
@@ -186,7 +181,7 @@ def _of_inertia(tree: Tree, name: str, link: int) -> Shape:
     I, m = tree.model.body_inertia[link], float(tree.model.body_mass[link])
     half = 0.5 * np.sqrt(np.maximum(6.0 * (I.sum() - 2.0 * I) / m, 1e-4))
     pose = tree.data.xipos[link], tree.data.ximat[link]
-    return _shape(tree, name, link, _BOX, half * 0.7, *pose)
+    return _shape(name, link, _BOX, half * 0.7, *pose)
 
 
 # Surfaces.
@@ -228,17 +223,16 @@ def with_surfaces(
     return shapes, {n: limbs[n] for n in order}
 
 
-def _points_of(tree: Tree, shapes: Sequence[Shape], links: set[int]) -> np.ndarray:
+def _points_of(shapes: Sequence[Shape], links: set[int]) -> np.ndarray:
     """(K, 3) points in the world on the shapes of links."""
     spec = mujoco.MjSpec()
     for s in shapes:
         if s.link in links:
-            R_WL = tree.data.xmat[s.link].reshape(3, 3)
             spec.worldbody.add_geom(
                 type=s.kind,
                 size=[*s.size, 0, 0][:3],
-                pos=tree.data.xpos[s.link] + R_WL @ s.position,
-                quat=quat_from_matrix(R_WL @ matrix_from_quat(s.quaternion)),
+                pos=s.position,
+                quat=quat_from_matrix(s.rotation),
             )
     model = spec.compile()
     alone = mujoco.MjData(model)
@@ -247,17 +241,18 @@ def _points_of(tree: Tree, shapes: Sequence[Shape], links: set[int]) -> np.ndarr
     return np.concatenate(points) if points else np.zeros((0, 3))
 
 
-def _ball(tree: Tree, name: str, link: int, centre: np.ndarray, radius: float) -> Shape:
+def _ball(name: str, link: int, centre: np.ndarray, radius: float) -> Shape:
     """Standing out a little."""
-    p, _ = tree.in_link(link, centre, np.eye(3))
-    return Shape(name=name, link=link, kind=_SPHERE, size=(radius + PAD,), position=p)
+    return Shape(
+        name=name, link=link, kind=_SPHERE, size=(radius + PAD,), position=centre
+    )
 
 
 def _hand(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape:
     """A ball at the far end of the hand, fingers and all."""
     end, elbow = int(tree.links[chain.end]), tree.data.xanchor[chain.elbow]
     hand = {b for b in tree.links.tolist() if tree.hangs_on(b, end)}
-    points = _points_of(tree, shapes, hand)
+    points = _points_of(shapes, hand)
     if len(points) == 0:
         points = tree.data.xipos[end][None]
     away = np.linalg.norm(points - elbow, axis=1)
@@ -272,7 +267,7 @@ def _hand(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape
     centre = elbow + middle + (float(along.max()) - radius) * u
     tip = points[along > along.max() - radius]
     radius = float(np.linalg.norm(tip - centre, axis=1).max())
-    return _ball(tree, name, end, centre, radius)
+    return _ball(name, end, centre, radius)
 
 
 def _joint_ball(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape:
@@ -286,7 +281,7 @@ def _joint_ball(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) ->
     link = int(links[chain.middle])
     past = {int(links[model.jnt_bodyid[j]]) for j in chain.joints[chain.bend :]}
     anchor, axis = data.xanchor[chain.elbow], data.xaxis[chain.elbow]
-    points = _points_of(tree, shapes, past)
+    points = _points_of(shapes, past)
     length = float(np.linalg.norm(data.xpos[chain.root] - anchor))
     on = tree.far(chain) - anchor
     reach = max(float(np.linalg.norm(on)), 1e-9)
@@ -299,10 +294,10 @@ def _joint_ball(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) ->
         radius = float(np.linalg.norm(near - anchor - middle, axis=1).max())
     radius = float(np.clip(radius, LEAST_BALL * length, LARGEST_BALL * length))
     beneath = -chain.sign * np.cross(axis, on)
-    others = _points_of(tree, shapes, past - {link}) - anchor
+    others = _points_of(shapes, past - {link}) - anchor
     depth = (others[others @ on < 0.5 * reach] @ beneath).max(initial=radius)
     middle = middle + (depth - radius) * beneath
-    return _ball(tree, name, link, anchor + middle, radius)
+    return _ball(name, link, anchor + middle, radius)
 
 
 def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
@@ -328,7 +323,7 @@ def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
     thick = max(0.5 * (ankle - low), 0.1 * (x1 - x0))
     centre = np.array([(x0 + x1) / 2, (y0 + y1) / 2, low + thick / 2])
     size = ((x1 - x0) / 2, (y1 - y0) / 2, thick / 2)
-    return _shape(tree, name, end, _BOX, size, centre, np.eye(3))
+    return _shape(name, end, _BOX, size, centre, np.eye(3))
 
 
 def _largest_rectangle(
@@ -445,7 +440,7 @@ def build_spec(
         if links[b] != b or not tree.hangs_on(b, found.base):
             continue
         parent = int(links[model.body_parentid[b]])
-        p, R = _from(data, parent, data.xpos[b], data.xmat[b])
+        p, R = tree.in_link(parent, data.xpos[b], data.xmat[b])
         if b == found.base:
             p = np.array([0.0, 0.0, float(data.xpos[b][2])])
         on = bodies.get(parent, spec.worldbody)
@@ -462,9 +457,7 @@ def build_spec(
         seen = looks and _add_looks(spec, body, tree, b, links, files)
         for s in shapes:
             if links[s.link] == b:
-                R_WS = data.xmat[s.link].reshape(3, 3)
-                p = data.xpos[s.link] + R_WS @ s.position
-                p, R = _from(data, b, p, R_WS @ matrix_from_quat(s.quaternion))
+                p, R = tree.in_link(b, s.position, s.rotation)
                 body.add_geom(
                     name=s.name,
                     type=s.kind,
@@ -481,14 +474,6 @@ def build_spec(
         spec.add_exclude(bodyname1=a, bodyname2=b)
     spec.assets = files
     return spec, files
-
-
-def _from(
-    data: mujoco.MjData, body: int, p: np.ndarray, R: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """A pose in the world as one in a body."""
-    R_WB = data.xmat[body].reshape(3, 3)
-    return R_WB.T @ (p - data.xpos[body]), R_WB.T @ R.reshape(3, 3)
 
 
 def _set_inertia(
@@ -554,7 +539,7 @@ def _add_looks(
         kind = mujoco.mjtGeom(int(model.geom_type[g]))
         if kind not in _KINDS and kind != mujoco.mjtGeom.mjGEOM_MESH:
             continue
-        p, R = _from(data, link, data.geom_xpos[g], data.geom_xmat[g])
+        p, R = tree.in_link(link, data.geom_xpos[g], data.geom_xmat[g])
         material = int(model.geom_matid[g])
         rgba = model.geom_rgba[g] if material < 0 else model.mat_rgba[material]
         added = body.add_geom(
