@@ -27,7 +27,7 @@ from rich.console import Console
 
 import clamber
 from clamber import cli
-from clamber.cli import commands, output
+from clamber.cli import flags, output, tools
 from clamber.execution.verdict import Figure, judge
 from conftest import ROOT
 from support.files import write_take
@@ -157,7 +157,7 @@ def test_an_interrupt_is_one_sentence_and_exit_130(
     def interrupt(self: object) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands.SceneCommand, "run", interrupt)
+    monkeypatch.setattr(tools.SceneCommand, "run", interrupt)
     assert cli.main(["scene", "scene.yaml"]) == output.INTERRUPTED
     assert capsys.readouterr().err.count("\n") == 1
 
@@ -165,10 +165,10 @@ def test_an_interrupt_is_one_sentence_and_exit_130(
 def test_the_flags_of_planning_are_fields_of_its_options():
     from clamber.planning.records import Method, PlanOptions
 
-    flags, options = commands.PlanningFlags(), PlanOptions()
-    for f in fields(commands.PlanningFlags):
-        assert getattr(flags, f.name) == getattr(options, f.name)
-    shown = get_type_hints(commands.PlanningFlags)["method"]
+    given, options = flags.PlanningFlags(), PlanOptions()
+    for f in fields(flags.PlanningFlags):
+        assert getattr(given, f.name) == getattr(options, f.name)
+    shown = get_type_hints(flags.PlanningFlags)["method"]
     assert get_args(shown) == get_args(Method)
 
 

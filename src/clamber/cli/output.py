@@ -57,6 +57,11 @@ class Output:
         else:
             yield progress_lines(console)
 
+    def warn(self, *texts: str) -> None:
+        """Say what could not be done, a sentence a line, on stderr."""
+        for text in texts if not self.quiet else ():
+            sys.stderr.write(f"clamber: {text}\n")
+
     def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
         """Print one JSON object, or tables and a closing sentence, on stdout."""
         if self.json:
