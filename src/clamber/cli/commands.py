@@ -128,7 +128,7 @@ class ContactsCommand:
 
     def run(self) -> int:
         """Recording to contact sequence."""
-        scene = None if self.scene is None else clamber.loadscene_of(self.scene)
+        scene = None if self.scene is None else clamber.load_scene(self.scene)
         with self.output.progress() as report:
             report("detect", 0.0, "")
             demo = clamber.load_demo(
@@ -318,7 +318,7 @@ class TraverseCommand:
                 "1 or more", source="--max-changes", value=self.max_changes
             )
         policy = clamber.load_policy(self.policy)
-        scene = clamber.loadscene_of(self.scene)
+        scene = clamber.load_scene(self.scene)
         robot = clamber.load_robot(self.robot)
         options = clamber.PlanOptions(
             **asdict(self.planning), max_changes=self.max_changes
