@@ -10,6 +10,7 @@ import pytest
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
+from clamber.recording.demonstration import runs
 from clamber.show import sample
 
 
@@ -56,12 +57,6 @@ def test_a_surface_stands_on_the_support_below_it(plan: Plan, rollout: Rollout):
     assert sample.support_below(plan.world, kin, "RFoot").name == "ground"
 
 
-def test_runs_of_a_mask_are_half_open():
-    mask = np.array([1, 1, 0, 0, 1, 0, 1], dtype=bool)
-    assert sample.runs_of(mask) == [(0, 2), (4, 5), (6, 7)]
-    assert sample.runs_of(np.zeros(3, dtype=bool)) == []
-
-
 def test_no_peak_is_lost_between_samples(rng: np.random.Generator):
     x = rng.normal(size=(100, 3))
     rows = np.array([0, 7, 30, 99])
@@ -94,10 +89,10 @@ def test_short_gaps_and_touches_are_none(rollout: Rollout):
     force[0:3, 4, 2] = 100.0  # no longer than that
     force[8:20, 5, 2] = 100.0  # later
     steady = sample.steadily_loaded(replace(rollout, contact_force=force))
-    runs = [sample.runs_of(column) for column in steady.T]
-    assert runs[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
-    assert runs[3:6] == [[(0, 9)], [(0, 3)], [(8, 20)]]
-    assert not any(runs[6:])
+    spans = [runs(column) for column in steady.T]
+    assert spans[:3] == [[(10, 60)], [(20, 40)], [(70, 80), (90, 99)]]
+    assert spans[3:6] == [[(0, 9)], [(0, 3)], [(8, 20)]]
+    assert not any(spans[6:])
 
 
 # When keyframes are reached.

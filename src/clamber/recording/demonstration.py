@@ -141,7 +141,7 @@ def build_demonstration(tracks: RawTracks) -> Demonstration:
     """
     raw = np.asarray(tracks.position, dtype=float)
     t = tracks.t0 + np.arange(len(raw)) / tracks.rate
-    ever = np.isfinite(raw).all(axis=2).any(axis=0)
+    ever = np.any(np.all(np.isfinite(raw), axis=2), axis=0)
     if needed := [
         n for n, ok in zip(tracks.names, ever, strict=True) if not ok and n in REQUIRED
     ]:

@@ -134,7 +134,8 @@ class _Tracks:
 
     def valid(self, *names: str) -> np.ndarray:
         """(T,) whether all these points are seen."""
-        return self.demo.valid[:, [self.demo.names.index(n) for n in names]].all(axis=1)
+        columns = [self.demo.names.index(n) for n in names]
+        return np.all(self.demo.valid[:, columns], axis=1)
 
     def samples(self, seconds: float) -> int:
         """So many samples last that long."""
@@ -246,7 +247,7 @@ def _nearness(
     above = np.array([s.inside(p, -slack) for s in supports]) & (height > _UNDER)
     out = []
     for k, spans in enumerate(seats):
-        covered = (above & (height < height[k])).any(axis=0)
+        covered = np.any(above & (height < height[k]), axis=0)
         possible = above[k] & ~covered & able
         if part.endswith("Knee"):
             for i, j in spans:
@@ -347,14 +348,14 @@ def _part_intervals(
             loose[row] &= w.holds(n.height, options.height_slack)
             strict[row] = loose[row] & (speed < options.enter_speed)
             strict[row] &= w.holds(n.height)
-        either = _join(tracks, part, loose.any(axis=0))
-        for whole in hysteresis(strict.any(axis=0), either, least):
+        either = _join(tracks, part, np.any(loose, axis=0))
+        for whole in hysteresis(np.any(strict, axis=0), either, least):
             for i, j in _places(tracks, points, strict, whole, least):
                 ends = {
                     leaving: [
                         _refine(tracks, p, support, i, j, leaving)
                         for p, ok in zip(
-                            points, loose[:, some].any(axis=1), strict=True
+                            points, np.any(loose[:, some], axis=1), strict=True
                         )
                         if ok
                     ]
@@ -393,7 +394,7 @@ def _places(
     i, j = whole
     if points == [points[0][0] + "Foot"]:
         return [(i, j)]
-    resting = runs(strict[:, i:j].any(axis=0))
+    resting = runs(np.any(strict[:, i:j], axis=0))
     still = [slice(a + i, b + i) for a, b in resting if b - a >= least]
     out, first = [], i
     for a, b in pairwise(still):
@@ -613,7 +614,9 @@ def _pelvis(tracks: _Tracks, middle: np.ndarray) -> np.ndarray | None:
 
 def _posture(tracks: _Tracks, middle: np.ndarray) -> dict[str, np.ndarray]:
     """Mean directions of the segments over samples."""
-    segments = {"trunk": (("LHip", "RHip"), ("LShoulder", "RShoulder"))}
+    segments: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+        "trunk": (("LHip", "RHip"), ("LShoulder", "RShoulder"))
+    }
     for s, side in zip(SIDES, ("left", "right"), strict=True):
         arm = (s + "Shoulder", s + "Elbow", wrist(tracks.demo.names, s))
         leg = (s + "Hip", s + "Knee", s + "Foot")

@@ -186,7 +186,9 @@ def _parsed(
             row, cell = int(said[1]), said[2]
             row -= cell is None  # NumPy counts rows from 1 where it counts cells
         if cell is None:
-            found = len(rows[lines[row]].split(delimiter and delimiter.encode()))
+            found = len(
+                rows[lines[row]].split(delimiter.encode() if delimiter else None)
+            )
             where = f"line {lines[row]}"
             raise InputError(f"{columns} cells", source, where, found) from e
         where = f"line {lines[row]}, cell {cell}"

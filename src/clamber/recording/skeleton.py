@@ -11,7 +11,7 @@ Shapes: T samples.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,6 +42,7 @@ _SIDED = {
     "Foot": ("ankle", "foot", "anklejoint"),
     "Foot.toe": ("toebase", "toe", "toes", "foot.toe", "ball", "foot", "footend"),
 }  # fmt: skip
+_PREFIXES = {"L": ("left", "l"), "R": ("right", "r")}
 _MIDDLE = {
     "Pelvis": ("pelvis", "hips", "hip", "root"),
     "Head": ("head",),
@@ -147,7 +148,6 @@ class Recognised:
 
 def recognise(
     names: Sequence[str],
-    *,
     parts: Mapping[str, str | Sequence[str]] | None = None,
     subject: str | None = None,
     source: object = None,
@@ -172,21 +172,15 @@ def recognise(
         several = [wanted] if isinstance(wanted, str) else list(wanted)
         for k, name in enumerate(several):
             if name not in index:
-                raise InputError(
-                    f"one of the names of the recording: {_listed(names)}",
-                    source=source,
-                    field=f"parts.{point}",
-                    value=name,
-                )
+                expected = f"one of the names of the recording: {_listed(names)}"
+                raise InputError(expected, source, f"parts.{point}", name)
             given[point if k == 0 else f"{point}.{k}"] = (index[name],)
     prefixes = _prefixes(names)
     if subject is not None:
         prefixes = [p for p in prefixes if p[:-1] == subject]
         if not prefixes:
-            raise InputError(
-                f"the beginning of names such as {_listed(names)}", source=source,
-                field="subject", value=subject,
-            )  # fmt: skip
+            expected = f"the beginning of names such as {_listed(names)}"
+            raise InputError(expected, source, "subject", subject)
     complete: dict[str, Recognised] = {}
     missing: list[str] = []
     for prefix in prefixes:
@@ -199,18 +193,14 @@ def recognise(
         elif not missing or len(lacking) < len(missing):
             missing = lacking
     if len(complete) > 1:
-        raise InputError(
-            f"which person is meant: one of {sorted(p[:-1] for p in complete)}",
-            source=source,
-            field="subject",
-        )
+        people = sorted(p[:-1] for p in complete)
+        raise InputError(f"which person is meant: one of {people}", source, "subject")
     if not complete:
-        raise InputError(
+        expected = (
             f"a joint or markers for each of {', '.join(missing)}: name them under "
-            f"`parts`; the recording has {_listed(names)}",
-            source=source,
-            field="names",
+            f"`parts`; the recording has {_listed(names)}"
         )
+        raise InputError(expected, source, "names")
     return next(iter(complete.values()))
 
 
@@ -263,7 +253,7 @@ def _joints(
     """Columns of canonical points, as many as the names tell."""
     columns = dict(given)
     given_parts = {p.split(".")[0] for p in given}
-    for side, prefixes in (("L", ("left", "l")), ("R", ("right", "r"))):
+    for side, prefixes in _PREFIXES.items():
         for point, words in _SIDED.items():
             if (side + point).split(".")[0] in given_parts:
                 continue
@@ -276,11 +266,9 @@ def _joints(
         found = next((plain[w] for w in words if w in plain), None)
         if point not in columns and found is not None:
             columns[point] = (found,)
-    for side, prefixes in (("L", ("left", "l")), ("R", ("right", "r"))):
-        found = next(
-            (plain[p + w] for w in _SIDED["Hand"] for p in prefixes if p + w in plain),
-            None,
-        )
+    for side, prefixes in _PREFIXES.items():
+        words = (p + w for w in _SIDED["Hand"] for p in prefixes)
+        found = next((plain[w] for w in words if w in plain), None)
         if found is not None and (found,) != columns.get(side + "Hand"):
             columns.setdefault(side + "Wrist", (found,))  # the hand was named otherwise
     return columns
@@ -411,5 +399,5 @@ def _filled(v: np.ndarray) -> np.ndarray:
     if known.all() or not known.any():
         return v
     k = np.arange(len(v))
-    columns: Iterable[np.ndarray] = (np.interp(k, k[known], x[known]) for x in v.T)
-    return _unit(np.stack(list(columns), axis=1))
+    columns = [np.interp(k, k[known], x[known]) for x in v.T]
+    return _unit(np.stack(columns, axis=1))

@@ -26,6 +26,7 @@ from clamber.model.scene import Support
 from clamber.model.world import World
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Samples, Trajectory
+from clamber.recording.demonstration import runs
 from clamber.run.folder import (
     EXECUTION,
     PLAN,
@@ -589,7 +590,7 @@ def steadily_loaded(rollout: Rollout) -> np.ndarray:
     step = float(rollout.time[-1] - rollout.time[0]) / max(last, 1)
     for column in loaded.T:
         for state in (True, False):
-            for a, b in runs_of(column != state):
+            for a, b in runs(column != state):
                 if (a > 0 or state) and b <= last and (b - a) * step < SHORTEST_LOAD:
                     column[a:b] = state
     return loaded
@@ -599,15 +600,9 @@ def spells(time: np.ndarray, contact: np.ndarray) -> list[list[tuple[float, floa
     """For each surface (columns) from when to when it is in contact [s]."""
     last = len(time) - 1
     return [
-        [(float(time[a]), float(time[min(b, last)])) for a, b in runs_of(column)]
+        [(float(time[a]), float(time[min(b, last)])) for a, b in runs(column)]
         for column in contact.T
     ]
-
-
-def runs_of(mask: np.ndarray) -> list[tuple[int, int]]:
-    """Half-open ranges in which a boolean (M,) mask is true."""
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return list(zip(steps[::2].tolist(), steps[1::2].tolist(), strict=True))
 
 
 def row_at(times: np.ndarray, t: float) -> int:
