@@ -8,12 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import yaml
 
 from clamber.contact.contact import DIRECTIONS, ContactInterval, ContactSequence
 from clamber.errors import InputError
 from clamber.model.scene import GROUND, Scene
-from clamber.model.se3 import matrix_from_quat
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy
 from clamber.recording.demonstration import (
     Demonstration,
     RawTracks,
@@ -27,7 +26,6 @@ from clamber.recording.detect import (
     hysteresis,
     noise_of,
 )
-from clamber.recording.recording import load_demo
 from support.climb import ClimbOptions, synthesize_climb
 
 ORDER = ("LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee")
@@ -48,21 +46,16 @@ def errors(sequence: ContactSequence, truth: list[ContactInterval]) -> np.ndarra
     return np.array([[found[k].t0 - i.t0, found[k].t1 - i.t1] for k, i in true.items()])
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("noise", [0.0, 0.002, 0.005])
-def test_true_contacts_and_no_others_are_found_within_50_ms(noise, seed):
-    demo, truth = climb(seed, noise=noise)
-    assert np.abs(errors(detect_contacts(demo), truth)).max() < 0.05
-
-
 @pytest.mark.parametrize(
     "options",
     [
+        {"noise": 0.0},
+        {"seed": 1},
+        {"seed": 2, "noise": 0.005},
         {"height_ratio": 0.57},
         {"height_ratio": 1.12},
         {"mirrored": True, "noise": 0.005},
         {"speed": 2.0, "noise": 0.005},
-        {"speed": 1.4},
         {"gaps": 25},
         {"rate": 60.0},
         {"rate": 240.0},
@@ -70,8 +63,8 @@ def test_true_contacts_and_no_others_are_found_within_50_ms(noise, seed):
     ],
     ids=str,
 )
-def test_detection_holds_for_other_heights_orders_speeds_and_rates(options):
-    demo, truth = climb(5, **options)
+def test_true_contacts_and_no_others_are_found_within_50_ms(options):
+    demo, truth = climb(**{"seed": 5, **options})
     assert np.abs(errors(detect_contacts(demo), truth)).max() < 0.05
 
 
@@ -86,10 +79,7 @@ def test_places_and_headings_are_those_of_the_contact():
     for i in detect_contacts(demo).intervals:
         there = true[i.part]
         np.testing.assert_allclose(i.contact.position, there.position, atol=5e-3)
-        R, R_true = (
-            matrix_from_quat(i.contact.quaternion),
-            matrix_from_quat(there.quaternion),
-        )
+        R, R_true = (matrix_from_quat(c.quaternion) for c in (i.contact, there))
         np.testing.assert_allclose(R[:, 2], [0, 0, 1], atol=1e-9)
         if not i.part.endswith("Hand"):  # a hand's heading follows the forearm
             assert R[:, 0] @ R_true[:, 0] > np.cos(0.15)
@@ -135,13 +125,7 @@ def test_posture_directions_are_the_recorded_ones():
 def test_detection_does_not_depend_on_where_the_world_lies():
     demo, _ = climb(noise=0.0, gaps=0)
     angle, shift = 0.7, np.array([3.0, -2.0, 0.0])
-    R = np.array(
-        [
-            [np.cos(angle), -np.sin(angle), 0],
-            [np.sin(angle), np.cos(angle), 0],
-            [0, 0, 1],
-        ]
-    )
+    R = matrix_from_rpy([0, 0, angle])
     box = demo.scene.boxes[0]
     there = replace(box, position=R @ box.position + shift, rotation=R @ box.rotation)
     scene = Scene(boxes=(there,), start=np.array([3.0, -2.0, angle]))
@@ -310,69 +294,3 @@ def test_the_instant_of_touching_is_fitted_through_noise(rng, true):
     p = np.maximum(true - s, 0)[:, None] / 120 * [0.1, 0.0, 0.35]
     p = p + 0.002 * rng.standard_normal((100, 3))
     assert abs(fit_instant(p, 50, 12) - true) <= 2
-
-
-def recording(shared, folder, tmp_path, **fields):
-    at = shared / "demos"
-    said = {
-        "file": str(at / folder / "joints.npy"),
-        "names": str(at / "joint_names.json"),
-        "boxes": str(at / folder / "boxes.obj"),
-        "rate": 120,
-        **fields,
-    }
-    path = tmp_path / "recording.yaml"
-    path.write_text(yaml.safe_dump(said))
-    return detect_contacts(load_demo(path))
-
-
-def first_on(sequence: ContactSequence, box: str) -> list[tuple[str, float]]:
-    """Parts in the order in which they first touch a box, with the times."""
-    seen: dict[str, float] = {}
-    for i in sequence.intervals:
-        if i.contact.support == box and i.is_surface:
-            seen.setdefault(i.part, i.t0)
-    return list(seen.items())
-
-
-CLIMB_0 = {"Hand": 5.5, "RKnee": 6.9, "LKnee": 8.1, "RFoot": 9.9, "LFoot": 10.6}
-CLIMB_1 = {"Hand": 2.65, "RKnee": 4.4, "LKnee": 5.4, "RFoot": 6.6, "LFoot": 7.5}
-
-
-@pytest.mark.parametrize(
-    ("folder", "fields", "expected"),
-    [
-        ("climb-0", {}, CLIMB_0),
-        ("climb-0", {"ground": "box2", "span": [3.5, 11.0]}, CLIMB_0),
-        ("climb-1", {}, CLIMB_1),
-    ],
-)
-def test_a_real_climb_is_read_as_people_read_it(
-    shared, tmp_path, folder, fields, expected
-):
-    order = first_on(recording(shared, folder, tmp_path, **fields), "box1")
-    assert {p for p, _ in order[:2]} == {"LHand", "RHand"}
-    assert [p for p, _ in order[2:]] == ["RKnee", "LKnee", "RFoot", "LFoot"]
-    for part, t in order:
-        assert t == pytest.approx(expected.get(part, expected["Hand"]), abs=0.2), part
-
-
-def test_a_real_person_who_sits_down_is_seated_and_does_not_kneel(shared, tmp_path):
-    sequence = recording(shared, "climb-0", tmp_path)
-    seats = [i for i in sequence.intervals if not i.is_surface]
-    assert [i.part for i in seats] == [SEAT]
-    assert seats[0].t0 == pytest.approx(16.05, abs=0.3)
-    assert seats[0].t1 == pytest.approx(18.5, abs=0.3)
-    late = [i.part for i in sequence.intervals if i.t0 > 11.0]
-    assert not [p for p in late if p.endswith(("Knee", "Elbow"))]
-
-
-def test_a_real_climb_ends_on_hands_and_knees_and_the_feet_leave_in_order(
-    shared, tmp_path
-):
-    sequence = recording(shared, "climb-0", tmp_path, ground="box2", span=[3.5, 8.45])
-    assert set(sequence.stances[-1].surfaces) == {"LHand", "RHand", "LKnee", "RKnee"}
-    assert sequence.stances[0].region == "G"
-    leaves = {i.part: i.t1 for i in sequence.intervals if i.contact.support == GROUND}
-    assert leaves["RFoot"] == pytest.approx(6.04, abs=0.2)
-    assert leaves["LFoot"] == pytest.approx(7.43, abs=0.2)
