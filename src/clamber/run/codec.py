@@ -1,7 +1,7 @@
 """Records <-> JSON and npz, by the type hints of their fields.
 
 A record is an object of its fields, an array nested lists, an enum its name (of words,
-its value), one of several records an object that says its `type`. What is None, False
+its value), a record that is one of several kinds says its `type`. What is None, False
 or empty text by default is left out while it is so. A `Form` says where a file differs.
 Reading checks everything and names file, field, value and what was expected.
 
@@ -14,19 +14,18 @@ written and floats in their shortest exact form, and numpy dates what lies in an
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import enum
 import functools
 import json
 import math
 import os
-import types
-import typing
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -34,18 +33,14 @@ from clamber.errors import InputError, unreadable
 from clamber.planning.trajectory import Samples
 
 VERSION = 2
+_PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
 _BROKEN = (
-    OSError,
-    ValueError,
-    EOFError,
-    zipfile.BadZipFile,
-    zlib.error,
-    NotImplementedError,
-    TypeError,  # a single array, which is no context
+    *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
+    *(NotImplementedError, TypeError),  # of a single array, which is no context
 )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Form:
     """How a record stands in a file, where that is not field by field.
 
@@ -55,22 +50,22 @@ class Form:
         null: What a number of a field is that JSON has no number for, by field.
         columns: Of arrays that may have no rows, by field.
         more: Keys that are for other readers alone.
-        kinds: Of a record, those that it may be one of.
+        kinds: Of a record that others are kinds of: those.
         write: The whole object in place of field by field, and
         read: the record of it; `ValueError` where it does not fit.
     """
 
-    names: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
     beside: Collection[str] = ()
-    null: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    columns: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    null: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, int] = field(default_factory=dict)
     more: Callable[[Any], Mapping[str, Any]] | None = None
     kinds: tuple[type, ...] = ()
     write: Callable[[Any], Mapping[str, Any]] | None = None
     read: Callable[[At], Any] | None = None
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class At:
     """A value of a file, and where it stands there."""
 
@@ -84,8 +79,7 @@ class At:
 
     def error(self, expected: str, value: object = None) -> InputError:
         """That something about it is not what was expected."""
-        field = self.field or None
-        return InputError(expected, source=self.file, field=field, value=value)
+        return InputError(expected, self.file, self.field or None, value)
 
     def wrong(self, expected: str) -> InputError:
         """That this value is not what was expected."""
@@ -105,10 +99,15 @@ class At:
 
     def key(self, name: str) -> At:
         """A field of it, an object."""
-        content = self.object()
-        if name not in content:
+        if name not in self.object():
             raise self.inside(name, None).error("a value: it is missing")
-        return self.inside(name, content[name])
+        return self.inside(name, self.value[name])
+
+    def choice(self, of: Mapping[str, Any]) -> Any:
+        """What is called like this."""
+        if not isinstance(self.value, str) or self.value not in of:
+            raise self.wrong(f"one of {', '.join(of)}")
+        return of[self.value]
 
 
 class Codec:
@@ -119,19 +118,14 @@ class Codec:
         self._forms = forms
 
     def _form(self, kind: type) -> Form:
-        """That of a record, or of what it is one of."""
+        """That of a record, or of what it is a kind of."""
         forms = (self._forms[k] for k in kind.__mro__ if k in self._forms)
         return next(forms, Form())
 
-    def _kinds(self, kind: Any) -> tuple[Any, ...]:
-        """What a hint allows, and of records those that there are of one."""
-        form = self._forms.get(kind, Form()) if isinstance(kind, type) else Form()
-        return form.kinds or _arms(kind)
-
     # JSON.
 
-    def encode(self, x: Any, kind: Any = None) -> Any:
-        """Numbers, strings, lists and dictionaries; `kind` is the hint of its field."""
+    def encode(self, x: Any) -> Any:
+        """Numbers, strings, lists and dictionaries."""
         match x:
             case enum.Enum():
                 return _word(x)
@@ -142,37 +136,27 @@ class Codec:
             case None | bool() | int() | str():
                 return x
             case Mapping():
-                of = ([*typing.get_args(kind), None, None])[1]
-                return {
-                    _word(k) if isinstance(k, enum.Enum) else str(k): self.encode(v, of)
-                    for k, v in x.items()
-                }
+                return {str(self.encode(k)): self.encode(v) for k, v in x.items()}
             case tuple() | list():
-                return [
-                    self.encode(v, of)
-                    for v, of in zip(x, _items(kind, len(x)), strict=True)
-                ]
-        if not dataclasses.is_dataclass(x):
-            raise TypeError(f"{type(x).__name__} does not go to a file")
-        out = self.object(x)
-        several = len([k for k in self._kinds(kind) if dataclasses.is_dataclass(k)]) > 1
-        return {"type": type(x).__name__, **out} if several else out
+                return [self.encode(v) for v in x]
+        return self.object(x)
 
     def object(self, x: Any, without: Collection[str] = ()) -> dict[str, Any]:
         """A record, all but some of its fields."""
         form = self._form(type(x))
         if form.write is not None:
             return self.encode(form.write(x))
-        out = self.encode(form.more(x)) if form.more is not None else {}
-        hints = _hints(type(x))
-        for f in dataclasses.fields(x):
+        out = {"type": type(x).__name__} if form.kinds else {}
+        out |= {} if form.more is None else self.encode(form.more(x))
+        for f in fields(x):
             value = getattr(x, f.name)
-            if f.name in without:
+            plain = value is None or isinstance(value, (bool, str))
+            if f.name in without or (plain and not value and value == f.default):
                 continue
             if f.name in form.beside:
                 out |= self.object(value)
-            elif f.init and not (_is_absent(value) and value == f.default):
-                out[form.names.get(f.name, f.name)] = self.encode(value, hints[f.name])
+            else:
+                out[form.names.get(f.name, f.name)] = self.encode(value)
         return out
 
     def decode(self, kind: Any, at: At) -> Any:
@@ -181,48 +165,57 @@ class Codec:
         Raises:
             InputError: It is none.
         """
-        arms = self._kinds(kind)
-        if len(arms) > 1:
-            return self._one_of(arms, at)
-        x, origin = at.value, typing.get_origin(kind) or kind
-        if dataclasses.is_dataclass(kind):
-            form = self._form(kind)
-            try:
-                if form.read is not None:
-                    return form.read(at)
-                return kind(**self.fields(kind, at))
-            except (ValueError, KeyError) as e:
-                reason = e.args[0] if e.args else e
-                raise at.error(f"fields that fit together ({reason})") from e
+        arms = _arms(kind)
+        if at.value is None and type(None) in arms:
+            return None
+        kind, *others = (k for k in arms if k is not type(None))
+        if others:
+            return self._first((kind, *others), at)
+        x, origin, args = at.value, get_origin(kind) or kind, get_args(kind)
+        if is_dataclass(kind):
+            return self._record(kind, at)
         if kind is np.ndarray:
-            return _array(at, math.nan, None)
-        if isinstance(origin, type) and issubclass(origin, Mapping):
-            key, of = typing.get_args(kind)
+            return _array(at)
+        if origin is Literal:
+            return at.choice({word: word for word in args})
+        if issubclass(origin, enum.Enum):
+            return at.choice({_word(member): member for member in origin})
+        if issubclass(origin, Mapping):
             return {
-                self.decode(key, at.inside(k, k)): self.decode(of, at.inside(k, v))
-                for k, v in at.object().items()
+                self.decode(args[0], at.inside(k, k)): self.decode(args[1], inside)
+                for k in at.object()
+                for inside in (at.key(k),)
             }
-        if origin in (tuple, list):
+        if issubclass(origin, tuple):
             inside = at.list()
-            kinds = _items(kind, len(inside))
+            kinds = [args[0]] * len(inside) if args[1:] == (...,) else args
             if len(kinds) != len(inside):
                 raise at.wrong(f"{len(kinds)} values")
-            return origin(map(self.decode, kinds, inside))
-        if isinstance(kind, type) and issubclass(kind, enum.Enum):
-            words = {_word(member): member for member in kind}
-            if not _is_text(x) or x not in words:
-                raise at.wrong(f"one of {', '.join(words)}")
-            return words[x]
-        if origin is Literal:
-            if x not in typing.get_args(kind):
-                raise at.wrong(_named(kind))
-            return x
-        if kind is Any:
-            return x
+            return tuple(map(self.decode, kinds, inside))
         good = isinstance(x, (int, float) if kind is float else kind)
         if not good or (isinstance(x, bool) and kind is not bool):
-            raise at.wrong(_named(kind))
-        return kind(x) if kind is float else x
+            raise at.wrong(_PLAIN[kind])
+        return float(x) if kind is float else x
+
+    def _first(self, kinds: tuple[Any, ...], at: At) -> Any:
+        """What the first of several kinds that can makes of it."""
+        expected = []
+        for kind in kinds:
+            try:
+                return self.decode(kind, at)
+            except InputError as e:
+                expected.append(e.expected)
+        raise at.wrong(" or ".join(expected))
+
+    def _record(self, kind: type, at: At) -> Any:
+        form = self._form(kind)
+        if form.kinds and kind not in form.kinds:
+            return self._record(at.key("type").choice(_by_name(form.kinds)), at)
+        try:
+            return form.read(at) if form.read else kind(**self.fields(kind, at))
+        except (ValueError, KeyError) as e:
+            reason = e.args[0] if e.args else e
+            raise at.error(f"fields that fit together ({reason})") from e
 
     def fields(
         self, kind: type, at: At, without: Collection[str] = ()
@@ -230,77 +223,46 @@ class Codec:
         """The fields of a record, all but those that are not in the file."""
         content, form, hints = at.object(), self._form(kind), _hints(kind)
         out: dict[str, Any] = {}
-        for f in dataclasses.fields(kind):
+        for f in fields(kind):
             key = form.names.get(f.name, f.name)
+            missing = (f.default, f.default_factory) == (MISSING, MISSING)
             if f.name in without or not f.init:
                 continue
             if f.name in form.beside:
                 out[f.name] = self.decode(hints[f.name], at)
-            elif key not in content:
-                default = f.default, f.default_factory
-                if default == (dataclasses.MISSING, dataclasses.MISSING):
-                    at.key(key)
-            else:
-                inside = at.key(key)
-                null, columns = form.null.get(f.name), form.columns.get(f.name)
+            elif key in content or missing:
+                inside, null = at.key(key), form.null.get(f.name)
                 if hints[f.name] is np.ndarray:
-                    out[f.name] = _array(inside, null, columns)
+                    out[f.name] = _array(inside, null, form.columns.get(f.name))
                 elif null is not None and inside.value is None:
                     out[f.name] = null
                 else:
                     out[f.name] = self.decode(hints[f.name], inside)
         return out
 
-    def _one_of(self, arms: tuple[Any, ...], at: At) -> Any:
-        """What one of several kinds makes of it; the fault of the last one, if none."""
-        if at.value is None and type(None) in arms:
-            return None
-        arms = tuple(k for k in arms if k is not type(None))
-        records = {k.__name__: k for k in arms if dataclasses.is_dataclass(k)}
-        if len(records) > 1 and isinstance(at.value, dict):
-            name = at.value.get("type")
-            if name not in records:
-                raise at.inside("type", name).wrong(f"one of {', '.join(records)}")
-            return self.decode(records[name], at)
-        for k in arms[:-1]:
-            with contextlib.suppress(InputError):
-                return self.decode(k, at)
-        try:
-            return self.decode(arms[-1], at)
-        except InputError as e:
-            if len(arms) == 1:
-                raise
-            said = " or ".join(_named(k) for k in arms)
-            raise at.wrong(said) from e
-
     # npz.
 
     def arrays(self, x: Any, without: Collection[str] = ()) -> dict[str, Any]:
-        """A record's arrays by key; numbers by name become two of them.
+        """A record's arrays by key.
 
-        The second one is called `<key>_keys`. What is neither numbers nor names is
-        there as the text of its JSON; what is None is not.
+        What is neither numbers nor names is there as the text of its JSON; what is None
+        is not.
         """
         names, hints = self._form(type(x)).names, _hints(type(x))
         out: dict[str, Any] = {}
-        for f in dataclasses.fields(x):
-            key, value = names.get(f.name, f.name), getattr(x, f.name)
+        for f in fields(x):
+            value = getattr(x, f.name)
             if f.name in without or value is None:
                 continue
-            if isinstance(value, Mapping):
-                out[f"{key}_keys"] = np.array([*value], dtype=str)
-                out[key] = np.array([*value.values()], dtype=float)
-            elif isinstance(value, tuple) and not _is_names(hints[f.name]):
-                out[key] = np.array(json.dumps(self.encode(value, hints[f.name])))
-            else:
-                out[key] = value
+            if isinstance(value, tuple) and hints[f.name] != tuple[str, ...]:
+                value = json.dumps(self.encode(value))
+            out[names.get(f.name, f.name)] = value
         return out
 
     def from_arrays(
         self,
         kind: type,
         arrays: Arrays,
-        *,
         shapes: Mapping[str, tuple[str | int, ...]],
         without: Collection[str] = (),
     ) -> dict[str, Any]:
@@ -315,22 +277,17 @@ class Codec:
         """
         names = self._form(kind).names
         out: dict[str, Any] = {}
-        known: dict[str, int] = {}
-        for f in dataclasses.fields(kind):
+        sizes: dict[str, int] = {}
+        for f in fields(kind):
             key, hint = names.get(f.name, f.name), _hints(kind)[f.name]
-            optional = type(None) in _arms(hint)
-            if f.name in without or (optional and key not in arrays):
+            if f.name in without or (key not in arrays and f.default is None):
                 continue
-            x = arrays.get(key, shapes.get(key, ()), known)
-            origin = typing.get_origin(hint) or hint
+            x = arrays.get(key, shapes.get(key, ()), sizes)
             if np.ndarray in _arms(hint):
                 out[f.name] = x
-            elif isinstance(origin, type) and issubclass(origin, Mapping):
-                keys = arrays.get(f"{key}_keys", (len(x),), known)
-                out[f.name] = dict(zip(keys.tolist(), x.tolist(), strict=True))
-            elif _is_names(hint):
+            elif hint == tuple[str, ...]:
                 out[f.name] = tuple(x.tolist())
-            elif origin is tuple:
+            elif get_origin(hint) is tuple:
                 at = At(parse(x.item(), arrays.file, key), arrays.file, key)
                 out[f.name] = self.decode(hint, at)
             else:
@@ -338,45 +295,18 @@ class Codec:
         return out
 
 
-# Type hints.
-
-
 @functools.cache
 def _hints(kind: type) -> dict[str, Any]:
-    return typing.get_type_hints(kind)
+    return get_type_hints(kind)
 
 
 def _arms(kind: Any) -> tuple[Any, ...]:
     """The kinds that a hint allows."""
-    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
-    return typing.get_args(kind) if union else (kind,)
+    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
 
 
-def _items(kind: Any, n: int) -> list[Any]:
-    """Hints of what is in a list or tuple of n, as far as its own hint says."""
-    for k in _arms(kind):
-        if typing.get_origin(k) in (tuple, list):
-            args = typing.get_args(k)
-            return [args[0]] * n if args[1:] in ((), (...,)) else [*args]
-    return [None] * n
-
-
-def _is_names(hint: Any) -> bool:
-    return typing.get_origin(hint) is tuple and typing.get_args(hint)[0] is str
-
-
-def _named(kind: Any) -> str:
-    """A kind, for people."""
-    if typing.get_origin(kind) is Literal:
-        words = [repr(x) for x in typing.get_args(kind)]
-        return " or ".join([", ".join(words[:-1]), words[-1]][len(words) == 1 :])
-    words = {
-        float: "a number",
-        int: "a whole number",
-        str: "text",
-        bool: "true or false",
-    }
-    return words.get(kind, f"a {getattr(kind, '__name__', kind)}")
+def _by_name(kinds: tuple[type, ...]) -> dict[str, type]:
+    return {k.__name__: k for k in kinds}
 
 
 def _word(member: enum.Enum) -> str:
@@ -384,15 +314,7 @@ def _word(member: enum.Enum) -> str:
     return member.value if isinstance(member, str) else member.name
 
 
-def _is_text(x: object) -> bool:
-    return isinstance(x, str)
-
-
-def _is_absent(x: object) -> bool:
-    return x is None or x is False or (isinstance(x, str) and not x)
-
-
-def _array(at: At, null: float | None, columns: int | None) -> np.ndarray:
+def _array(at: At, null: float | None = None, columns: int | None = None) -> np.ndarray:
     """Nested lists as an array of floats, or of booleans; null stands for `null`."""
     try:
         x = np.array(at.value)
@@ -410,9 +332,9 @@ def _numbers(at: At, null: float | None) -> Any:
         return [_numbers(x, null) for x in at.list()]
     if at.value is None and null is not None:
         return null
-    if isinstance(at.value, (int, float)):
-        return at.value
-    raise at.wrong("a number")
+    if not isinstance(at.value, (int, float)):
+        raise at.wrong("a number")
+    return at.value
 
 
 # Files.
@@ -437,17 +359,15 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _text(x: Any, before: str = "\n") -> str:
-    nested = (str, bool, list, dict)
-    if not x or not (
-        isinstance(x, dict)
-        or (isinstance(x, list) and any(isinstance(v, nested) for v in x))
-    ):
-        return json.dumps(x, allow_nan=False)
+    """JSON with a line for each item, but for those of a list of numbers."""
     inside = before + " "
-    if isinstance(x, dict):
+    if isinstance(x, dict) and x:
         rows = [f"{json.dumps(k)}: {_text(v, inside)}" for k, v in x.items()]
         return "{" + inside + f",{inside}".join(rows) + before + "}"
-    return "[" + inside + f",{inside}".join(_text(v, inside) for v in x) + before + "]"
+    if isinstance(x, list) and any(isinstance(v, (str, bool, list, dict)) for v in x):
+        rows = [_text(v, inside) for v in x]
+        return "[" + inside + f",{inside}".join(rows) + before + "]"
+    return json.dumps(x, allow_nan=False)
 
 
 def parse(text: str, file: Path, field: str = "", *, maker: str = "") -> Any:
@@ -522,9 +442,7 @@ class Arrays:
             reason = e.strerror if isinstance(e, OSError) and e.strerror else e
             if "pickle" in str(e):  # what numpy takes any other content for
                 reason = "it holds something else"
-            raise InputError(
-                f"a whole .npz file ({reason}); {maker}", source=file
-            ) from e
+            raise InputError(f"a whole .npz file ({reason}); {maker}", file) from e
 
     def __contains__(self, name: str) -> bool:
         """Whether there is one of that name."""
@@ -544,7 +462,7 @@ class Arrays:
             InputError: There is none of that shape.
         """
         if name not in self._arrays:
-            raise InputError("an array: there is none", source=self.file, field=name)
+            raise InputError("an array: there is none", self.file, name)
         x = self._arrays[name]
         if len(shape) == x.ndim:
             for size, n in zip(shape, x.shape, strict=True):
@@ -552,16 +470,14 @@ class Arrays:
                     sizes.setdefault(size, n)
         wanted = tuple(sizes.get(n, n) if isinstance(n, str) else n for n in shape)
         if x.shape != wanted:
-            text = ", ".join(map(str, wanted))
-            field = f"shape of {name}"
-            raise InputError(f"({text})", source=self.file, field=field, value=x.shape)
+            text = f"({', '.join(map(str, wanted))})"
+            raise InputError(text, self.file, f"shape of {name}", x.shape)
         if x.dtype.kind == "f" and not np.all(np.isfinite(x)):
-            raise InputError("finite numbers only", source=self.file, field=name)
+            raise InputError("finite numbers only", self.file, name)
         return x
 
     def same(self, name: str, wanted: tuple[str, ...]) -> None:
         """Refuse names that are not those of the world."""
         if (found := tuple(self._arrays[name].tolist())) != wanted:
             expected = f"those of the scene, {', '.join(wanted)}"
-            value = ", ".join(map(str, found))
-            raise InputError(expected, source=self.file, field=name, value=value)
+            raise InputError(expected, self.file, name, ", ".join(map(str, found)))

@@ -23,11 +23,10 @@ from clamber.errors import InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
-from clamber.planning.records import Plan
 from clamber.planning.trajectory import RATE, Trajectory
 from clamber.run.codec import whole_file
 from clamber.run.folder import ROLLOUT, load_plan, load_rollout, trajectory_of
-from clamber.run.lead_in import SPEED, LeadIn, lead_in_motion, measured_posture
+from clamber.run.lead_in import SPEED, States, lead_in_motion, measured_posture
 
 Format = Literal["csv", "mcap", "npz"]
 Layout = Literal["mjlab", "holosoma"]
@@ -44,29 +43,21 @@ class Motion:
     Attributes:
         world: As planned.
         rate: [Hz].
-        lead_in: Samples before the run itself.
-        q: (T, nq); v: (T, nv) its derivative on the manifold; tau: (T, na) [N m].
+        reference: T samples of what was followed.
+        states: What physics made of it, where it has run; else the same.
         contact: (T, nS) bool; surfaces in the order of `world`.
         force: (T, nS, 3) on each surface in physics [N], in the world; zero in the
             lead-in, which physics has not run; None where there is no rollout.
-        state: q, v and joint torques as physics made them, where it has run; else
-            those above.
+        lead_in: Samples before the run itself.
     """
 
     world: World
     rate: int
-    lead_in: int
-    q: np.ndarray
-    v: np.ndarray
-    tau: np.ndarray
+    reference: States
+    states: States
     contact: np.ndarray
     force: np.ndarray | None
-    state: tuple[np.ndarray, np.ndarray, np.ndarray]
-
-    @property
-    def time(self) -> np.ndarray:
-        """(T,) [s], from the first sample."""
-        return np.arange(len(self.q)) / self.rate
+    lead_in: int = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -120,10 +111,10 @@ def export_run(
     ):
         if given not in known:
             words = ", ".join(filter(None, known))
-            raise InputError(f"one of {words}", source=flag, value=given)
+            raise InputError(f"one of {words}", flag, value=given)
     if layout is not None and to != "npz":
         text = "no layout for this format: it goes with --to npz"
-        raise InputError(text, source="--layout", value=layout)
+        raise InputError(text, "--layout", value=layout)
     folder = Path(folder)
     file = folder / f"motion.{to}" if out is None else Path(out)
     motion = load_motion(
@@ -142,11 +133,11 @@ def export_run(
                 _write_npz(motion, draft, layout or "mjlab")
     except OSError as e:
         text = f"a file that can be written ({e.strerror or e})"
-        raise InputError(text, source="--out", value=str(file)) from e
+        raise InputError(text, "--out", value=str(file)) from e
     return Exported(
         file=file,
         rate=motion.rate,
-        samples=len(motion.q),
+        samples=len(motion.contact),
         lead_in=motion.lead_in / motion.rate,
         forces=motion.force is not None,
     )
@@ -172,90 +163,76 @@ def load_motion(
     folder = Path(folder)
     if rate <= 0 or RATE % rate:
         text = f"a divisor of {RATE:.0f} Hz, as 50 or 100"
-        raise InputError(text, source="--rate", value=rate)
+        raise InputError(text, "--rate", value=rate)
     plan = load_plan(folder)
     reference = trajectory_of(plan, folder)
     rollout = load_rollout(folder) if (folder / ROLLOUT).exists() else None
-    motion = _sampled(plan, reference, rollout, rate)
+    motion = _sampled(plan.world, reference, rollout, rate)
     if lead_in is None:
         return motion
     lead = lead_in_motion(
         plan.world,
         measured_posture(plan.world, lead_in),
-        motion.q[0],
-        tau=motion.tau[0],
-        stance=plan.keyframes[0].stance,
+        motion.reference,
+        stance=plan.start.stance,
         rate=rate,
         speed=lead_in_speed,
     )
-    return _after(lead, motion)
+    n, force = len(lead.q), motion.force
+    if force is not None:
+        force = np.concatenate([np.zeros((n, *force.shape[1:])), force])
+    first = np.repeat(motion.contact[:1], n, axis=0)
+    return replace(
+        motion,
+        reference=lead.then(motion.reference),
+        states=lead.then(motion.states),
+        contact=np.concatenate([first, motion.contact]),
+        force=force,
+        lead_in=n,
+    )
 
 
 def _sampled(
-    plan: Plan, reference: Trajectory, rollout: Rollout | None, rate: int
+    world: World, reference: Trajectory, rollout: Rollout | None, rate: int
 ) -> Motion:
     """The reference on the grid of `rate`; states and forces held since the last one.
 
     Sample k of the reference is the command of physics step k.
     """
-    t = reference
-    world = plan.world
-    n = len(t.time)
+    t, n = reference, len(reference.time)
     if rollout is not None:
         t = rollout.followed or t
         n = min(len(t.time), len(rollout.ctrl))
     k = np.arange(0, n, round(RATE / rate))
-    q, v, tau = t.q[k], t.v[k], t.tau[k]
-    if rollout is None:
-        state, force = (q, v, tau), None
-    else:
+    followed = states = States(q=t.q[k], v=t.v[k], tau=t.tau[k])
+    force = None
+    if rollout is not None:
         if rollout.followed is not None:
-            v = _with_base_velocity(Kinematics(world), q, v, rate)
+            v = _with_base_velocity(Kinematics(world), followed, rate)
+            followed = replace(followed, v=v)
         j = k // rollout.stride
         order = [rollout.world.model.actuator(name).id for name in world.joints]
         effort = rollout.actuator_force[j][:, order]
-        state, force = (
-            (rollout.qpos[j], rollout.qvel[j], effort),
-            rollout.contact_force[j],
-        )
+        states = States(q=rollout.qpos[j], v=rollout.qvel[j], tau=effort)
+        force = rollout.contact_force[j]
     return Motion(
         world=world,
         rate=rate,
-        lead_in=0,
-        q=q,
-        v=v,
-        tau=tau,
+        reference=followed,
+        states=states,
         contact=t.contact[k],
         force=force,
-        state=state,
     )
 
 
-def _with_base_velocity(
-    kin: Kinematics, q: np.ndarray, v: np.ndarray, rate: int
-) -> np.ndarray:
+def _with_base_velocity(kin: Kinematics, x: States, rate: int) -> np.ndarray:
     """`v` (T, nv) with that of the base by differences of q: execution keeps none."""
-    out, last = v.copy(), len(q) - 1
-    for k in range(len(q)):
+    out, last = x.v.copy(), len(x.q) - 1
+    for k in range(len(x.q)):
         a, b = max(k - 1, 0), min(k + 1, last)
         if b > a:
-            out[k, :6] = kin.difference(q[a], q[b])[:6] * rate / (b - a)
+            out[k, :6] = kin.difference(x.q[a], x.q[b])[:6] * rate / (b - a)
     return out
-
-
-def _after(lead: LeadIn, motion: Motion) -> Motion:
-    """The motion with a lead-in before it, which physics has not run."""
-    n, m = len(lead.q), motion
-    force = m.force
-    if force is not None:
-        force = np.concatenate([np.zeros((n, *force.shape[1:])), force])
-    q, v, tau = map(np.concatenate, ((lead.q, m.q), (lead.v, m.v), (lead.tau, m.tau)))
-    ran = zip((lead.q, lead.v, lead.tau), m.state, strict=True)
-    contact = np.concatenate([np.repeat(m.contact[:1], n, axis=0), m.contact])
-    state = tuple(map(np.concatenate, ran))
-    return replace(
-        m, lead_in=n, q=q, v=v, tau=tau, contact=contact, force=force, state=state
-    )
 
 
 # CSV.
@@ -263,33 +240,31 @@ def _after(lead: LeadIn, motion: Motion) -> Motion:
 
 def _write_csv(m: Motion, path: Path) -> None:
     """One row a sample; numbers in their shortest exact form, units in the header."""
-    w = m.world
+    w, x, n = m.world, m.reference, len(m.contact)
     header = ["time [s]"]
     header += [f"base {a} [m]" for a in "xyz"] + [f"base q{a} [-]" for a in "wxyz"]
     header += [f"base v{a} [m/s]" for a in "xyz"]
     header += [f"base w{a} [rad/s]" for a in "xyz"]
-    columns = [m.time[:, None], m.q[:, :7], m.v[:, :6]]
+    columns = [np.arange(n)[:, None] / m.rate, x.q[:, :7], x.v[:, :6]]
     for what, values in (
-        ("position [rad]", m.q[:, w.qadr]),
-        ("velocity [rad/s]", m.v[:, w.dadr]),
-        ("torque [N m]", m.tau),
+        ("position [rad]", x.q[:, w.qadr]),
+        ("velocity [rad/s]", x.v[:, w.dadr]),
+        ("torque [N m]", x.tau),
     ):
         header += [f"{j} {what}" for j in w.joints]
         columns.append(values)
     header += [f"{s} contact [-]" for s in w.surfaces]
+    forces = np.zeros((n, 0))
     if m.force is not None:
         header += [f"{s} force {a} [N]" for s in w.surfaces for a in "xyz"]
+        forces = m.force.reshape(n, -1)
     numbers = np.concatenate(columns, axis=1).tolist()
     flags = m.contact.astype(int).tolist()
-    forces = (
-        [[]] * len(m.q) if m.force is None else m.force.reshape(len(m.q), -1).tolist()
-    )
+    rows = zip(numbers, flags, forces.tolist(), strict=True)
     with path.open("w", newline="") as stream:
         out = csv.writer(stream, lineterminator="\n")
         out.writerow(header)
-        out.writerows(
-            [*a, *b, *c] for a, b, c in zip(numbers, flags, forces, strict=True)
-        )
+        out.writerows([*a, *b, *c] for a, b, c in rows)
 
 
 # npz.
@@ -324,17 +299,17 @@ def body_states(
 
 def _write_npz(m: Motion, path: Path, layout: Layout) -> None:
     """Arrays without pickle, by the names that trackers read."""
-    w = m.world
-    names, position, orientation, linear, angular = body_states(w, m.q, m.v)
+    w, q, v = m.world, m.reference.q, m.reference.v
+    names, position, orientation, linear, angular = body_states(w, q, v)
     joints = layout == "mjlab"
     arrays: dict[str, Any] = {
         "fps": np.array([m.rate]),
-        "qpos": m.q,
-        "qvel": m.v,
+        "qpos": q,
+        "qvel": v,
         "joint_names": np.array(w.joints),
-        "joint_pos": m.q[:, w.qadr] if joints else m.q,
-        "joint_vel": m.v[:, w.dadr] if joints else m.v,
-        "joint_torque": m.tau,
+        "joint_pos": q[:, w.qadr] if joints else q,
+        "joint_vel": v[:, w.dadr] if joints else v,
+        "joint_torque": m.reference.tau,
         "body_names": np.array(names),
         "body_pos_w": position,
         "body_quat_w": orientation,
@@ -428,21 +403,21 @@ def _write_mcap(m: Motion, path: Path) -> None:
         ):
             kind = "trajectory_msgs/msg/JointTrajectory"
             write(topic, kind, 0, _trajectory_message(m, with_effort=effort))
-        q, v, effort = m.state
-        for k in range(len(m.q)):
+        x = m.states
+        for k in range(len(x.q)):
             ns = k * (1_000_000_000 // m.rate)
             header = {"stamp": _time(ns), "frame_id": WORLD}
             joints = {
                 "header": header,
                 "name": list(m.world.joints),
-                "position": q[k, m.world.qadr].tolist(),
-                "velocity": v[k, m.world.dadr].tolist(),
-                "effort": effort[k].tolist(),
+                "position": x.q[k, m.world.qadr].tolist(),
+                "velocity": x.v[k, m.world.dadr].tolist(),
+                "effort": x.tau[k].tolist(),
             }
             write("/joint_states", "sensor_msgs/msg/JointState", ns, joints)
             transform = {
-                "translation": _xyz(q[k, :3]),
-                "rotation": {**_xyz(q[k, 4:7]), "w": float(q[k, 3])},
+                "translation": _xyz(x.q[k, :3]),
+                "rotation": {**_xyz(x.q[k, 4:7]), "w": float(x.q[k, 3])},
             }
             moved = {"header": header, "child_frame_id": base, "transform": transform}
             write("/tf", "tf2_msgs/msg/TFMessage", ns, {"transforms": [moved]})
@@ -462,14 +437,15 @@ def _trajectory_message(m: Motion, *, with_effort: bool) -> dict[str, Any]:
     Torques are not in the one that `joint_trajectory_controller` is sent: it refuses
     those, unless it commands efforts.
     """
+    x = m.reference
     points = [
         {
-            "positions": m.q[k, m.world.qadr].tolist(),
-            "velocities": m.v[k, m.world.dadr].tolist(),
-            "effort": m.tau[k].tolist() if with_effort else [],
+            "positions": x.q[k, m.world.qadr].tolist(),
+            "velocities": x.v[k, m.world.dadr].tolist(),
+            "effort": x.tau[k].tolist() if with_effort else [],
             "time_from_start": _time(k * (1_000_000_000 // m.rate)),
         }
-        for k in range(len(m.q))
+        for k in range(len(x.q))
     ]
     header = {"stamp": _time(0), "frame_id": ""}
     return {"header": header, "joint_names": list(m.world.joints), "points": points}

@@ -33,8 +33,8 @@ TORQUE_NODES = 11  # postures whose torques are computed
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class LeadIn:
-    """The motion, up to one sample before the first posture.
+class States:
+    """A motion of the whole robot.
 
     Attributes:
         q: (n, nq); v: (n, nv) its derivative on the manifold; tau: (n, na) [N m].
@@ -43,6 +43,14 @@ class LeadIn:
     q: np.ndarray
     v: np.ndarray
     tau: np.ndarray
+
+    def then(self, after: States) -> States:
+        """This, then another."""
+        return States(
+            q=np.concatenate([self.q, after.q]),
+            v=np.concatenate([self.v, after.v]),
+            tau=np.concatenate([self.tau, after.tau]),
+        )
 
 
 def measured_posture(
@@ -65,20 +73,17 @@ def measured_posture(
         source, angles = given, read_yaml(Path(given))
     if unknown := [str(n) for n in angles if n not in world.joints]:
         known = f"a joint of {world.robot.name}: {', '.join(world.joints)}"
-        raise InputError(known, source=source, field=unknown[0])
+        raise InputError(known, source, unknown[0])
     out = np.empty(len(world.joints))
     for i, name in enumerate(world.joints):
         if name not in angles:
-            text = "an angle of every joint: there is none"
-            raise InputError(text, source=source, field=name)
+            raise InputError("an angle of every joint: there is none", source, name)
         low, high = (x[world.dadr[i]] for x in (world.q_min, world.q_max))
         x = angles[name]
         number = isinstance(x, Real) and not isinstance(x, bool)
         if not number or not low <= x <= high:  # NaN is not either
-            text, value = f"{low:.4g} to {high:.4g} rad, its limits", x
-            if x is None:
-                value = "nothing"
-            raise InputError(text, source=source, field=name, value=value)
+            text = f"{low:.4g} to {high:.4g} rad, its limits"
+            raise InputError(text, source, name, "nothing" if x is None else x)
         out[i] = x
     return out
 
@@ -86,20 +91,18 @@ def measured_posture(
 def lead_in_motion(
     world: World,
     measured: np.ndarray,
-    first: np.ndarray,
+    motion: States,
     *,
-    tau: np.ndarray,
     stance: tuple[Contact, ...],
     rate: int,
     speed: float = SPEED,
-) -> LeadIn:
-    """Move from a measured posture to the first one of a plan.
+) -> States:
+    """Move from a measured posture to the first one of a plan, up to a sample before.
 
     Args:
         world: Of the plan.
         measured: (na,) joint angles [rad].
-        first: (nq,) the first posture.
-        tau: (na,) the torques there [N m].
+        motion: That begins with the first one.
         stance: Its contacts.
         rate: [Hz].
         speed: Of the fastest joint [rad/s].
@@ -108,7 +111,8 @@ def lead_in_motion(
         InputError: The speed is none, or links would meet on the way.
     """
     if not (speed > 0 and math.isfinite(speed)):
-        raise InputError("more than 0 rad/s", source="--lead-in-speed", value=speed)
+        raise InputError("more than 0 rad/s", "--lead-in-speed", value=speed)
+    first = motion.q[0]
     way = first[world.qadr] - measured
     n = math.ceil(PEAK * float((np.abs(way) / speed).max(initial=0.0)) * rate)
     if n:
@@ -126,9 +130,9 @@ def lead_in_motion(
         holding_torque(kin, _between(world, measured, first, x), stance)
         for x in nodes[:-1]
     ]
-    columns = np.transpose([*held, tau])
+    columns = np.transpose([*held, motion.tau[0]])
     torques = [np.interp(s, nodes, column) for column in columns]
-    return LeadIn(q=q, v=v, tau=np.stack(torques, axis=1))
+    return States(q=q, v=v, tau=np.stack(torques, axis=1))
 
 
 def _between(
@@ -166,8 +170,8 @@ def _check(
             i = int(np.argmin(near.distance))
             a, b = (world.model.geom(int(g)).name for g in world.pairs[near.pairs[i]])
             where = f"after {100 * share:.0f} % of the way" if share else "in it"
-            raise InputError(
+            text = (
                 "a measured posture from which the first one is reached in a straight"
-                f" line: {a} and {b} would meet {where}",
-                source="--lead-in",
+                f" line: {a} and {b} would meet {where}"
             )
+            raise InputError(text, "--lead-in")
