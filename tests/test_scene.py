@@ -275,10 +275,13 @@ def test_the_edge_towards_a_place_is_the_nearest_of_all_points_of_the_border(rng
 
 def test_of_two_edges_at_a_corner_that_is_taken_which_faces_the_place():
     square = support_of(SQUARE)
-    corner = square.position[:2] - 1.0
-    edge = square.edge_towards(corner - [0.3, 0.1])
-    np.testing.assert_allclose(edge.point[:2], corner)
-    np.testing.assert_allclose(edge.inward, [1.0, 0.0], atol=1e-12)
+    for corner in square.vertices[:, :2]:
+        out = np.sign(corner - square.position[:2])
+        for away in (np.array([0.3, 0.1]), np.array([0.1, 0.3])):
+            edge = square.edge_towards(corner + out * away)
+            np.testing.assert_allclose(edge.point[:2], corner)
+            facing = out * (away == away.max())
+            np.testing.assert_allclose(edge.inward, -facing, atol=1e-12)
 
 
 def test_the_support_below_is_the_highest_that_is_there(rng):
@@ -296,8 +299,8 @@ def test_the_support_below_is_the_highest_that_is_there(rng):
         assert found.name == best[0]
         assert found.level(p) == pytest.approx(best[1])
     assert scene.below(np.array([0.0, 0.0, -0.1])) is None
-    beside = shelf.top.position + np.array([0.0, 0.52, -0.01])
-    assert [scene.below(beside, x).name for x in (0.0, 0.1)] == [GROUND, "shelf"]
+    beside = shelf.top.position + 0.52 * shelf.top.rotation[:, 1] - [0, 0, 0.01]
+    assert [scene.below(beside, x).name for x in (0.0, 0.1)] == ["box", "shelf"]
 
 
 # Files.
