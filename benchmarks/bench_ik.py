@@ -16,6 +16,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
+from clamber.contact.contact import Contact
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import World, build_world
@@ -23,11 +24,10 @@ from clamber.step.ik import (
     IK,
     STEP_ROTATION,
     STEP_TRANSLATION,
-    ContactGoal,
     PostureProblem,
-    base_clearance,
     contact_clearance,
 )
+from clamber.step.tasks import Closed, Reaching
 
 POSTURES = 300
 REPEATS = 20  # iterations from home, to see that all three solve the same problem
@@ -49,35 +49,32 @@ def feet_middle(world: World) -> np.ndarray:
     return np.array([*corners[:, :2].mean(axis=0), ik.kin.com[2]])
 
 
+def contact_at(surface: str, p: np.ndarray) -> Contact:
+    """Of a surface with the ground at `p` (3,)."""
+    return Contact(
+        surface=surface, support="ground", position=p, quaternion=np.eye(4)[0]
+    )
+
+
 def clamber_step(world: World, *, collisions: bool) -> Step:
     ik = IK(world)
     ik.kin.update(world.home)
-    goals = []
+    tasks = []
     up = np.array([0.0, 0.0, 1.0])
     for f in FEET:
         p = ik.kin.contact_point(f, up)
-        goals.append(
-            ContactGoal(surface=f, support="ground", position=p, rotation=np.eye(3))
-        )
+        tasks.append(Closed(contact=contact_at(f, p), rotation=np.eye(3)))
     for hand, p in HANDS.items():
         # A surface's goal is where it would touch: a ball's lowest point.
         low = p - up * world.surfaces[hand].radius
-        goals.append(
-            ContactGoal(
-                surface=hand,
-                support="ground",
-                position=low,
-                rotation=np.eye(3),
-                hard=False,
-                reference=HAND,
-            )
-        )
+        at = contact_at(hand, low)
+        tasks.append(Reaching(contact=at, rotation=np.eye(3), weight=HAND))
     clearance = np.full(len(world.pairs), -np.inf)
     if collisions:
         where = dict.fromkeys(FEET, "ground")
-        clearance = contact_clearance(world, base_clearance(world, MARGIN), where)
+        clearance = contact_clearance(world, MARGIN, where)
     problem = PostureProblem(
-        goals=tuple(goals),
+        tasks=tuple(tasks),
         q_reference=world.home,
         clearance=clearance,
         balance=False,  # the others have no such rows

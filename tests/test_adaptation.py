@@ -390,7 +390,7 @@ def test_a_policy_goes_on_with_what_leans_kept_farther_off_where_that_can_be(
     wary = {(int(leaning), "box"): 0.03}
 
     def stub(plan, ik, key):
-        asked.append(bool(ik._wary.any()))
+        asked.append(bool(ik.extra))
         return answers[asked[-1]]
 
     monkeypatch.setattr(adaptation, "_rest", stub)

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.robot import load_robot
@@ -21,26 +22,32 @@ from clamber.model.se3 import (
 from clamber.model.world import World, build_world
 from clamber.step.ik import (
     DAMPING,
-    EDGE_INSET,
-    EDGE_ROOM,
-    EDGE_WEIGHT,
     IK,
     PENALTY,
-    ROUGHNESS_WEIGHT,
     SOFT,
     STEP_ROTATION,
     STEP_TRANSLATION,
-    ContactGoal,
     PostureProblem,
-    base_clearance,
     contact_clearance,
 )
 from clamber.step.statics import support_ellipse, support_polygon
+from clamber.step.tasks import (
+    EDGE_INSET,
+    EDGE_ROOM,
+    EDGE_WEIGHT,
+    ROUGHNESS_WEIGHT,
+    Closed,
+    OnEdge,
+    Reaching,
+    Sliding,
+    SurfaceTask,
+)
 
 UP = np.array([0.0, 0.0, 1.0])
 BALLS = ("LHand", "RElbow", "LKnee")
 SUPPORTS = ("ground", "yawed", "tilted")
 STEP = 1e-6
+IN_PLACE = np.eye(3)
 
 
 @pytest.fixture(scope="module")
@@ -83,20 +90,37 @@ def bent(world: World, seed: int) -> np.ndarray:
     return q
 
 
-def goal_at(ik: IK, q: np.ndarray, surface: str, support: str, **kind) -> ContactGoal:
-    """A goal that is met where the surface is at `q`."""
+def task_at(
+    ik: IK, q: np.ndarray, surface: str, support: str, kind=Closed, **more
+) -> SurfaceTask:
+    """A task that is met where the surface is at `q`; `more` of it or its contact."""
     kin, w = ik.kin, ik.world
     kin.update(q)
     s = w.surfaces[surface]
-    n = w.supports[support].normal
     R = kin.rotation(s.body) @ (s.rotation if s.rotation is not None else np.eye(3))
-    p = kin.contact_point(surface, n, kind.get("edge"))
-    start = {"position": p, "rotation": R}
-    return ContactGoal(surface=surface, support=support, **(start | kind))
+    edge, link = more.pop("edge", None), more.pop("link", None)
+    if link is not None:
+        link = quat_from_matrix(kin.rotation(s.body))
+    contact = Contact(
+        surface=surface,
+        support=support,
+        position=kin.contact_point(surface, w.supports[support].normal, edge),
+        quaternion=quat_from_matrix(R),
+        edge=edge,
+        link=link,
+    )
+    kind = kind if edge is None else OnEdge
+    return kind(contact=contact, rotation=R, **more)
 
 
-def problem_of(world: World, *goals: ContactGoal, **changes) -> PostureProblem:
-    """Only these goals: nothing else pulls, and nothing can collide."""
+def moved(task: SurfaceTask, by=(0.0, 0.0, 0.0), turn=IN_PLACE) -> SurfaceTask:
+    """The same task elsewhere."""
+    contact = replace(task.contact, position=task.contact.position + by)
+    return replace(task, contact=contact, rotation=turn @ task.rotation)
+
+
+def problem_of(world: World, *tasks: SurfaceTask, **changes) -> PostureProblem:
+    """Only these tasks: nothing else pulls, and nothing can collide."""
     nothing = {
         "clearance": np.full(len(world.pairs), -np.inf),
         "q_reference": world.home,
@@ -105,7 +129,7 @@ def problem_of(world: World, *goals: ContactGoal, **changes) -> PostureProblem:
         "com_weight": 0.0,
         "base_weight": 0.0,
     }
-    return PostureProblem(goals=goals, **(nothing | changes))
+    return PostureProblem(tasks=tasks, **(nothing | changes))
 
 
 def hard_rows(qp, nv: int) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +168,8 @@ HELD = [
     *[(s, p, {"link": True}) for s in BALLS for p in SUPPORTS],
     *[("LFoot", p, {}) for p in SUPPORTS],
     *[("RFoot", p, {"edge": e}) for e in range(4) for p in ("ground", "tilted")],
-    *[("LKnee", p, {"free": True}) for p in SUPPORTS],
-    *[("RFoot", p, {"free": True}) for p in SUPPORTS],
+    *[("LKnee", p, {"kind": Sliding}) for p in SUPPORTS],
+    *[("RFoot", p, {"kind": Sliding}) for p in SUPPORTS],
 ]
 ROWS = {"edge": 5, "flat": 6, "ball": 3, "free flat": 3, "free ball": 1}
 
@@ -154,19 +178,15 @@ ROWS = {"edge": 5, "flat": 6, "ball": 3, "free flat": 3, "free ball": 1}
 def test_rows_of_a_contact_are_the_derivative_of_its_error(ik, surface, support, kind):
     w = ik.world
     q = bent(w, 1)
-    ik.kin.update(q)
-    if kind.get("link"):
-        body = w.surfaces[surface].body
-        kind = {"link": quat_from_matrix(ik.kin.rotation(body))}
-    goal = goal_at(ik, q, surface, support, **kind)
+    goal = task_at(ik, q, surface, support, **kind)
     problem = problem_of(w, goal)
     nv = w.model.nv
     J, e = hard_rows(ik.build(problem, q), nv)
     name = "flat" if w.surfaces[surface].is_flat else "ball"
-    if "free" in kind:
+    if "kind" in kind:
         name = "free " + name
     assert len(J) == ROWS["edge" if "edge" in kind else name]
-    if "free" not in kind:
+    if "kind" not in kind:
         np.testing.assert_allclose(e, 0.0, atol=1e-7)  # the contact is closed
     numeric = jacobian(ik, q, lambda x: -hard_rows(ik.build(problem, x), nv)[1])
     np.testing.assert_allclose(J, numeric, atol=2e-7)
@@ -177,10 +197,9 @@ def test_rows_of_a_contact_are_the_derivative_of_its_error(ik, surface, support,
 def test_an_open_contact_asks_for_the_step_that_closes_it(ik, surface):
     """J dq = e asks for p + J dq = target: the sign of e is that of the gap."""
     q = bent(ik.world, 2)
-    goal = goal_at(ik, q, surface, "ground")
+    goal = task_at(ik, q, surface, "ground")
     gap = np.array([0.03, -0.02, 0.04])
-    moved = replace(goal, position=goal.position + gap)
-    problem = problem_of(ik.world, moved)
+    problem = problem_of(ik.world, moved(goal, gap))
     J, e = hard_rows(ik.build(problem, q), ik.world.model.nv)
     np.testing.assert_allclose(e[:3], gap, atol=1e-12)
     ik.kin.update(q)
@@ -193,10 +212,10 @@ def test_an_open_contact_asks_for_the_step_that_closes_it(ik, surface):
 
 def test_a_flat_contact_asks_for_the_turn_that_lays_it_flat(ik):
     q = bent(ik.world, 3)
-    goal = goal_at(ik, q, "LFoot", "ground")
+    goal = task_at(ik, q, "LFoot", "ground")
     turn = np.array([0.02, -0.01, 0.03])
-    R = Rotation.from_rotvec(turn).as_matrix() @ goal.rotation
-    problem = problem_of(ik.world, replace(goal, rotation=R))
+    R = Rotation.from_rotvec(turn).as_matrix()
+    problem = problem_of(ik.world, moved(goal, turn=R))
     _, e = hard_rows(ik.build(problem, q), ik.world.model.nv)
     np.testing.assert_allclose(e[3:], turn, atol=1e-9)
 
@@ -205,9 +224,7 @@ def test_a_rolling_contact_follows_its_link_along_a_finite_turn(ik):
     """Turned about one axis by much, the rows still predict how the error goes on."""
     w = ik.world
     q = w.home.copy()
-    ik.kin.update(q)
-    link = quat_from_matrix(ik.kin.rotation(w.surfaces["LKnee"].body))
-    goal = goal_at(ik, q, "LKnee", "ground", link=link)
+    goal = task_at(ik, q, "LKnee", "ground", link=True)
     problem = problem_of(w, goal)
     v = np.zeros(w.model.nv)
     v[[0, 4]] = 0.3, 0.8  # forwards, and the pelvis about its own y
@@ -223,8 +240,7 @@ def test_a_wheel_that_rolls_keeps_its_contact_closed(ik):
     w = ik.world
     ik.kin.update(w.home)
     s = w.surfaces["LKnee"]
-    link = quat_from_matrix(ik.kin.rotation(s.body))
-    goal = goal_at(ik, w.home, "LKnee", "ground", link=link)
+    goal = task_at(ik, w.home, "LKnee", "ground", link=True)
     centre = ik.kin.point(s.body, s.centre).copy()
     for theta in (-1.0, 0.3, 1.4):
         R = Rotation.from_rotvec([0.0, theta, 0.0])
@@ -235,7 +251,9 @@ def test_a_wheel_that_rolls_keeps_its_contact_closed(ik):
         q[:3] = rolled + R.apply(w.home[:3] - centre)
         residuals = ik.residuals(problem_of(w, goal), q)
         assert residuals.contact == pytest.approx(0.0, abs=1e-9)
-        held = replace(goal, link=None)  # without rolling, that is an open contact
+        held = replace(
+            goal, contact=replace(goal.contact, link=None)
+        )  # rolls not: open
         open_by = ik.residuals(problem_of(w, held), q).contact
         assert open_by == pytest.approx(s.radius * abs(theta), abs=1e-9)
 
@@ -249,23 +267,21 @@ def soft_problems(ik: IK, q: np.ndarray, off: float) -> dict[str, PostureProblem
     turn = Rotation.from_rotvec(off * np.array([0.6, -0.5, 0.62])).as_matrix()
     shift = off * np.array([0.5, -0.7, 0.5])
 
-    def moved(goal: ContactGoal) -> ContactGoal:
-        return replace(
-            goal, position=goal.position + shift, rotation=turn @ goal.rotation
-        )
+    def off_by(task: SurfaceTask) -> SurfaceTask:
+        return moved(task, shift, turn)
 
     problems = {
         "target of a ball": problem_of(
-            w, moved(goal_at(ik, q, "LHand", "ground", hard=False, reference=2.0))
+            w, off_by(task_at(ik, q, "LHand", "ground", Reaching, weight=2.0))
         ),
         "target of a foot": problem_of(
-            w, moved(goal_at(ik, q, "RFoot", "ground", hard=False, reference=3.0))
+            w, off_by(task_at(ik, q, "RFoot", "ground", Reaching, weight=3.0))
         ),
         "pelvis": problem_of(w, base_weight=0.4),
         "posture": problem_of(w, posture_weight=0.3, q_reference=q.copy()),
     }
-    knee = goal_at(ik, q, "LKnee", "tilted", free=True, reference=1.5)
-    problems["reference of a free contact"] = problem_of(w, moved(knee))
+    knee = task_at(ik, q, "LKnee", "tilted", Sliding, reference=1.5)
+    problems["reference of a free contact"] = problem_of(w, off_by(knee))
     kin.update(q)
     R_WB = turn @ kin.rotation(w.base)
     problems["pelvis"] = replace(problems["pelvis"], base_rotation=R_WB)
@@ -377,11 +393,11 @@ def test_the_reference_of_a_free_contact_acts_within_its_plane(ik):
     q = posture_for(ik, "reference of a free contact")
     support = w.supports["tilted"]
     n = support.normal
-    goal = goal_at(ik, q, "LKnee", "tilted", free=True, reference=2.0)
-    above = replace(goal, position=goal.position + 0.3 * n)
+    goal = task_at(ik, q, "LKnee", "tilted", Sliding, reference=2.0)
+    above = moved(goal, 0.3 * n)
     qp = ik.build(problem_of(w, above), q)
     np.testing.assert_allclose(qp.c, 0.0, atol=1e-9)
-    beside = replace(goal, position=goal.position + 0.1 * support.rotation[:, 1])
+    beside = moved(goal, 0.1 * support.rotation[:, 1])
     qp = ik.build(problem_of(w, beside), q)
     expected = -4.0 * 0.1 * support.rotation[:, 1]  # towards it: the base's own motion
     np.testing.assert_allclose(qp.c[:3], expected, atol=1e-9)
@@ -390,33 +406,33 @@ def test_the_reference_of_a_free_contact_acts_within_its_plane(ik):
 def test_a_surface_on_its_edge_would_rather_lie_flat(ik):
     """About its own edge it may turn, softly drawn back: 1/2 (0.3 turn)^2."""
     w, q = ik.world, ik.world.home
-    goal = goal_at(ik, q, "LFoot", "ground", edge=1)
+    goal = task_at(ik, q, "LFoot", "ground", edge=1)
     s = w.surface("LFoot", 1)
     ik.kin.update(q)
     axis = ik.kin.rotation(s.body) @ (s.corners[1] - s.corners[0])
     axis /= np.linalg.norm(axis)
-    turned = Rotation.from_rotvec(0.2 * axis).as_matrix() @ goal.rotation
-    problem = problem_of(w, replace(goal, rotation=turned))
+    turned = Rotation.from_rotvec(0.2 * axis).as_matrix()
+    problem = problem_of(w, moved(goal, turn=turned))
     qp = ik.build(problem, q)
     _, e = hard_rows(qp, w.model.nv)
     np.testing.assert_allclose(e, 0.0, atol=1e-7)  # the turn is no violation
     assert qp.merit == pytest.approx(0.5 * (0.3 * 0.2) ** 2)
-    _, rot = ik.kin.jacobians(s.body, goal.position)
+    _, rot = ik.kin.jacobians(s.body, goal.contact.position)
     np.testing.assert_allclose(qp.c, 0.09 * -0.2 * axis @ rot, atol=1e-9)
     assert ik.residuals(problem, q).contact == pytest.approx(0.0, abs=1e-7)
 
 
 def test_a_free_sole_may_turn_about_the_normal_and_would_rather_not(ik):
     w, q = ik.world, ik.world.home
-    goal = goal_at(ik, q, "RFoot", "ground", free=True)
-    yawed = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix() @ goal.rotation
-    problem = problem_of(w, replace(goal, rotation=yawed))
+    goal = task_at(ik, q, "RFoot", "ground", Sliding)
+    yawed = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
+    problem = problem_of(w, moved(goal, turn=yawed))
     qp = ik.build(problem, q)
     np.testing.assert_allclose(hard_rows(qp, w.model.nv)[1], 0.0, atol=1e-6)
     assert qp.merit == pytest.approx(0.5 * (0.3 * 0.4) ** 2, abs=1e-6)
     assert ik.residuals(problem, q).contact == pytest.approx(0.0, abs=1e-6)
-    tilted = Rotation.from_rotvec([0.1, 0.0, 0.0]).as_matrix() @ goal.rotation
-    problem = problem_of(w, replace(goal, rotation=tilted))
+    tilted = Rotation.from_rotvec([0.1, 0.0, 0.0]).as_matrix()
+    problem = problem_of(w, moved(goal, turn=tilted))
     assert ik.residuals(problem, q).contact == pytest.approx(0.1, abs=1e-6)
 
 
@@ -444,7 +460,7 @@ def test_stability_is_weighted_so_that_its_cost_is_that_of_the_method(ik):
     """(4.25): w || X - S ||^2, X where the contact is, S under the shoulder."""
     w, weight = ik.world, 5.0
     q = bent(w, 6)
-    goal = goal_at(ik, q, "LHand", "ground", free=True, stability=weight)
+    goal = task_at(ik, q, "LHand", "ground", Sliding, stability=weight)
     data = mujoco.MjData(w.model)
 
     def cost(x: np.ndarray) -> float:
@@ -482,7 +498,7 @@ def test_a_free_contact_stays_inside_its_support(ik, surface, support, rng):
         ik.kin.update(q)
         corner = s.position + s.rotation[:, :2] @ (s.polygon[2] * 0.9)
         q[:3] += corner - ik.kin.contact_point(surface, s.normal)
-    problem = problem_of(w, goal_at(ik, q, surface, support, free=True))
+    problem = problem_of(w, task_at(ik, q, surface, support, Sliding))
     nv = w.model.nv
     A, lo, hi = soft_limits(ik.build(problem, q), nv)
     if support == "ground":
@@ -509,23 +525,16 @@ STANCES = {
     "feet and a rolling hand": {"LFoot": {}, "RFoot": {}, "LHand": {"link": True}},
     "feet and a hand": {"LFoot": {}, "RFoot": {}, "RHand": {}},
     "foot and elbows": {"LFoot": {}, "LElbow": {"link": True}, "RElbow": {}},
-    "a free hand": {"LFoot": {}, "RFoot": {}, "LHand": {"free": True}},
-    "a free foot": {"LFoot": {}, "RFoot": {"free": True}},
+    "a free hand": {"LFoot": {}, "RFoot": {}, "LHand": {"kind": Sliding}},
+    "a free foot": {"LFoot": {}, "RFoot": {"kind": Sliding}},
     "four balls": {n: {"link": True} for n in ("LKnee", "RKnee", "LElbow", "RElbow")},
     "an edge of a foot": {"LFoot": {"edge": 0}, "RKnee": {}, "RHand": {"link": True}},
 }
 
 
 def stance(ik: IK, q: np.ndarray, name: str, support: str, **changes) -> PostureProblem:
-    goals = []
-    for surface, given in STANCES[name].items():
-        kind = dict(given)
-        if kind.get("link"):
-            ik.kin.update(q)
-            body = ik.world.surfaces[surface].body
-            kind["link"] = quat_from_matrix(ik.kin.rotation(body))
-        goals.append(goal_at(ik, q, surface, support, **kind))
-    return problem_of(ik.world, *goals, balance=True, **changes)
+    tasks = [task_at(ik, q, s, support, **kind) for s, kind in STANCES[name].items()]
+    return problem_of(ik.world, *tasks, balance=True, **changes)
 
 
 @pytest.mark.parametrize("support", ["ground", "tilted"])
@@ -543,9 +552,8 @@ def test_balance_rows_follow_the_centre_of_mass_and_the_polygon(ik, name, suppor
 
     def rooms(x: np.ndarray) -> np.ndarray:
         ik.kin.update(x)
-        points = [
-            ik.kin.bearing_points(g.surface, n, g.edge)[:, :2] for g in problem.goals
-        ]
+        contacts = [x.contact for x in problem.tasks]
+        points = [ik.kin.bearing_points(c.surface, n, c.edge)[:, :2] for c in contacts]
         return halfplane_rooms(np.concatenate(points), ik.kin.com[:2]) - 0.03
 
     def balance(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -580,7 +588,7 @@ def test_the_centre_of_mass_is_drawn_to_the_middle_of_the_polygon(ik):
 def test_distance_rows_are_the_derivatives_of_distances(ik, seed, rng):
     w, nv = ik.world, ik.world.model.nv
     q = bent(w, 20 + seed)
-    problem = problem_of(w, clearance=base_clearance(w, 0.02))
+    problem = problem_of(w, clearance=contact_clearance(w, 0.02, {}))
     A, lo, hi = soft_limits(ik.build(problem, q), nv)
     assert np.all(hi > 1e29)
     ik.kin.update(q)
@@ -608,7 +616,7 @@ def test_distance_rows_are_the_derivatives_of_distances(ik, seed, rng):
 
 def test_pairs_without_a_clearance_have_no_row(ik):
     w = ik.world
-    clearance = base_clearance(w, 0.02)
+    clearance = contact_clearance(w, 0.02, {})
     q = bent(w, 20)
     every = len(ik.build(problem_of(w, clearance=clearance), q).A)
     ik.kin.update(q)
@@ -619,8 +627,7 @@ def test_pairs_without_a_clearance_have_no_row(ik):
 
 def test_a_surface_may_touch_the_support_it_stands_on_and_no_other(ik):
     w = ik.world
-    free = base_clearance(w, 0.01)
-    allowed = contact_clearance(w, free, {"LKnee": "yawed", "RFoot": "ground"})
+    allowed = contact_clearance(w, 0.01, {"LKnee": "yawed", "RFoot": "ground"})
     name = w.model.geom
     changed = {}
     for (a, b), c in zip(w.pairs, allowed, strict=True):
@@ -632,8 +639,7 @@ def test_a_surface_may_touch_the_support_it_stands_on_and_no_other(ik):
         frozenset(("LKnee", "yawed")): -np.inf,  # left to the contact task
         frozenset(("RFoot", "ground")): -np.inf,
     }
-    np.testing.assert_array_equal(free, 0.01)
-    rolling = contact_clearance(w, free, {"RFoot": "ground"}, rolling=("RFoot",))
+    rolling = contact_clearance(w, 0.01, {"RFoot": "ground"}, rolling=("RFoot",))
     assert sorted(set(rolling.tolist())) == [0.0, 0.01]
 
 
@@ -743,20 +749,22 @@ def test_a_link_in_contact_with_what_is_rough_is_as_near_as_its_contact(rough):
     w = rough.world
     q = hand_over(rough, "yawed", 0.001)
     wanted = problem_of(w, clearance=only(w, "LHand", 0.0))
-    held = goal_at(rough, q, "LHand", "yawed")
-    touching = contact_clearance(w, wanted.clearance, {"LHand": "yawed"})
+    held = task_at(rough, q, "LHand", "yawed")
+    where = contact_clearance(w, 0.0, {"LHand": "yawed"})
+    touching = np.minimum(wanted.clearance, where)
     free = rough.build(wanted, q).merit
     assert free == pytest.approx(0.5 * (ROUGHNESS_WEIGHT * 0.029) ** 2, rel=1e-3)
     for clear in (wanted.clearance, touching):
-        problem = replace(wanted, goals=(held,), clearance=clear)
+        problem = replace(wanted, tasks=(held,), clearance=clear)
         assert rough.build(problem, q).merit == pytest.approx(0.0, abs=1e-9)
     # In contact with another support, or only on its way, it keeps its distance.
-    elsewhere = goal_at(rough, q, "LHand", "ground")
-    for goal in (elsewhere, replace(held, hard=False)):
-        problem = replace(wanted, goals=(goal,))
+    elsewhere = task_at(rough, q, "LHand", "ground")
+    reaching = task_at(rough, q, "LHand", "yawed", Reaching, weight=0.0)
+    for goal in (elsewhere, reaching):
+        problem = replace(wanted, tasks=(goal,))
         assert rough.build(problem, q).merit == pytest.approx(free, rel=1e-6)
-    other = goal_at(rough, q, "RHand", "ground")
-    problem = replace(wanted, goals=(other,))
+    other = task_at(rough, q, "RHand", "ground")
+    problem = replace(wanted, tasks=(other,))
     assert rough.build(problem, q).merit == pytest.approx(free, rel=1e-6)
 
 
@@ -768,7 +776,7 @@ def test_a_part_that_is_known_to_have_touched_keeps_off_by_so_much_more(world):
     wanted = problem_of(world, clearance=only(world, "LHand", 0.01))
     cost = 0.5 * (ROUGHNESS_WEIGHT * 0.04) ** 2
     assert ik.build(wanted, q).merit == pytest.approx(cost, rel=1e-6)
-    held = replace(wanted, goals=(goal_at(ik, q, "LHand", "yawed"),))
+    held = replace(wanted, tasks=(task_at(ik, q, "LHand", "yawed"),))
     away = ik.build(replace(held, clearance=only(world, "RHand", 0.01)), q).merit
     assert ik.build(held, q).merit - away == pytest.approx(cost, rel=1e-6)
     for geom, box in (("RHand", "yawed"), ("LHand", "tilted")):
@@ -802,7 +810,7 @@ def near_border(ik: IK, room: float) -> np.ndarray:
 @pytest.mark.parametrize("room", [0.016, 0.03, 0.044])
 def test_too_near_a_border_costs_the_square_of_what_is_missing(ik, room):
     q = near_border(ik, room)
-    free = problem_of(ik.world, goal_at(ik, q, "LHand", "yawed", free=True))
+    free = problem_of(ik.world, task_at(ik, q, "LHand", "yawed", Sliding))
     cost = 0.5 * (EDGE_WEIGHT * (EDGE_ROOM - room)) ** 2
     assert ik.build(free, q).merit == pytest.approx(cost, rel=1e-6)
 
@@ -815,13 +823,13 @@ def test_too_near_a_border_costs_the_square_of_what_is_missing(ik, room):
 
     numeric = jacobian(ik, q, alone, 1e-5)
     np.testing.assert_allclose(ik.build(free, q).c, numeric, atol=1e-6)
-    held = problem_of(ik.world, goal_at(ik, q, "LHand", "yawed"))
+    held = problem_of(ik.world, task_at(ik, q, "LHand", "yawed"))
     assert ik.build(held, q).merit == pytest.approx(0.0, abs=1e-9)
 
 
 def test_farther_inside_no_border_counts(ik):
     q = near_border(ik, EDGE_ROOM + 1e-4)
-    free = problem_of(ik.world, goal_at(ik, q, "LHand", "yawed", free=True))
+    free = problem_of(ik.world, task_at(ik, q, "LHand", "yawed", Sliding))
     assert ik.build(free, q).merit == pytest.approx(0.0, abs=1e-9)
     assert not ik.build(free, q).c.any()
 
@@ -834,15 +842,12 @@ def test_over_what_is_rough_a_limb_keeps_farther_away_where_it_can(plain):
         boxes = tuple(replace(b, roughness=roughness) for b in scene.boxes)
         ik = IK(build_world(plain.world.robot, replace(scene, boxes=boxes)))
         problem = stance_problem(ik)
-        feet, hand = problem.goals[:2], problem.goals[2]
-        way = replace(hand, position=hand.position + 0.015 * UP, hard=False)
-        way = replace(way, free=False, loaded=False, reference=5.0)
-        clearance = contact_clearance(
-            ik.world,
-            base_clearance(ik.world, 0.01),
-            {f.surface: "ground" for f in feet},
-        )
-        problem = replace(problem, goals=(*feet, way), clearance=clearance)
+        *feet, hand = problem.tasks
+        above = moved(hand, 0.015 * UP)
+        way = Reaching(contact=above.contact, rotation=above.rotation, weight=5.0)
+        where = {"LFoot": "ground", "RFoot": "ground"}
+        clearance = contact_clearance(ik.world, 0.01, where)
+        problem = replace(problem, tasks=(*feet, way), clearance=clearance)
         solution = ik.solve_hard(problem, ik.world.home)
         assert solution.status is Status.SOLVED
         heights.append(gap(ik.world, solution.q, "LHand", "box"))
@@ -855,28 +860,40 @@ def test_over_what_is_rough_a_limb_keeps_farther_away_where_it_can(plain):
 # Bounds on joints and steps, and the QP's solution.
 
 
+def hand_on_box(x: float, y: float) -> Contact:
+    return Contact(
+        surface="LHand",
+        support="box",
+        position=np.array([x, y, 0.275]),
+        quaternion=np.eye(4)[0],
+    )
+
+
 def stance_problem(plain: IK, **changes) -> PostureProblem:
     """Feet where they stand, the left hand on the box, everything else switched on."""
     w = plain.world
-    feet = [goal_at(plain, w.home, f, "ground") for f in ("LFoot", "RFoot")]
-    hand = ContactGoal(
-        surface="LHand",
-        support="box",
-        position=np.array([0.38, 0.17, 0.275]),
+    feet = [task_at(plain, w.home, f, "ground") for f in ("LFoot", "RFoot")]
+    hand = Sliding(
+        contact=hand_on_box(0.38, 0.17),
         rotation=np.eye(3),
-        free=True,
         stability=5.0,
         reference=1.5,
     )
     where = {"LFoot": "ground", "RFoot": "ground", "LHand": "box"}
     usual = {
-        "goals": (*feet, hand),
+        "tasks": (*feet, hand),
         "q_reference": w.home,
-        "clearance": contact_clearance(w, base_clearance(w, 0.01), where),
+        "clearance": contact_clearance(w, 0.01, where),
         "directions": {"trunk": np.array([0.5, 0.0, np.sqrt(0.75)])},
         "direction_weight": 0.2,
     }
     return PostureProblem(**(usual | changes))
+
+
+def beside(left: SurfaceTask, right: SurfaceTask, y: float) -> SurfaceTask:
+    """The left foot so far to the left of the right one."""
+    at = right.contact.position + np.array([0.0, y, 0.0])
+    return replace(left, contact=replace(left.contact, position=at))
 
 
 def test_bounds_are_the_room_left_to_the_limits(ik):
@@ -942,9 +959,9 @@ def test_a_step_is_where_the_model_of_the_merit_is_least(plain, rng):
 def test_the_model_of_the_merit_is_its_derivative(plain, rng):
     """What makes every short step lower the merit: also where constraints fight."""
     nv = plain.world.model.nv
-    left, right, hand = stance_problem(plain).goals
-    near = replace(left, position=right.position + np.array([0.0, 0.06, 0.0]))
-    problem = stance_problem(plain, goals=(near, right, hand))
+    left, right, hand = stance_problem(plain).tasks
+    near = beside(left, right, 0.06)
+    problem = stance_problem(plain, tasks=(near, right, hand))
     q = plain.kin.integrate(plain.world.home, 0.02 * rng.normal(size=nv))
     qp = plain.build(problem, q)
     _, slope = penalised(qp, nv, np.zeros(nv))
@@ -961,25 +978,24 @@ def test_the_model_of_the_merit_is_its_derivative(plain, rng):
 def test_contacts_that_contradict_one_another_give_a_step_all_the_same(ik):
     w = ik.world
     q = w.home
-    here = goal_at(ik, q, "LFoot", "ground")
-    there = replace(here, position=here.position + np.array([0.04, 0.0, 0.0]))
+    here = task_at(ik, q, "LFoot", "ground")
+    there = moved(here, [0.04, 0.0, 0.0])
     problem = problem_of(w, here, there)
     dq = ik.step(ik.build(problem, q))
     assert np.all(np.isfinite(dq))
     ik.kin.update(ik.kin.integrate(q, dq))
     p = ik.kin.contact_point("LFoot", UP)
-    np.testing.assert_allclose(p, (here.position + there.position) / 2, atol=2e-3)
+    np.testing.assert_allclose(
+        p, moved(here, [0.02, 0.0, 0.0]).contact.position, atol=2e-3
+    )
 
 
 def test_joint_limits_hold_at_every_iteration(plain):
     w = plain.world
-    far = ContactGoal(  # asks for more than the joints can give
-        surface="LHand",
-        support="box",
-        position=np.array([1.0, -0.6, 0.275]),
-        rotation=np.eye(3),
-    )
-    problem = stance_problem(plain, goals=(*stance_problem(plain).goals[:2], far))
+    far = Closed(
+        contact=hand_on_box(1.0, -0.6), rotation=np.eye(3)
+    )  # asks for more than the joints can give
+    problem = stance_problem(plain, tasks=(*stance_problem(plain).tasks[:2], far))
     q, at_limit = w.home, 0
     for _ in range(25):
         q = plain.kin.integrate(q, plain.step(plain.build(problem, q)))
@@ -998,7 +1014,8 @@ def measured(world: World, problem: PostureProblem, q: np.ndarray) -> dict[str, 
     data.qpos[:] = q
     mujoco.mj_forward(m, data)
     contact, points = 0.0, []
-    for g in problem.goals:
+    for x in problem.tasks:
+        g = x.contact
         support = world.supports[g.support]
         geom = data.geom(g.surface)
         R = geom.xmat.reshape(3, 3)
@@ -1007,7 +1024,7 @@ def measured(world: World, problem: PostureProblem, q: np.ndarray) -> dict[str, 
             p = geom.xpos - R[:, 2] * size[2]
             signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
             bearing = p + (signs * size[:2]) @ R[:, :2].T
-            tilt = np.arccos(np.clip((np.trace(R @ g.rotation.T) - 1) / 2, -1, 1))
+            tilt = np.arccos(np.clip((np.trace(R @ x.rotation.T) - 1) / 2, -1, 1))
             contact = max(contact, float(tilt))
         else:
             p = geom.xpos - size[0] * support.normal
@@ -1015,7 +1032,10 @@ def measured(world: World, problem: PostureProblem, q: np.ndarray) -> dict[str, 
         points.append(bearing)
         gap = p - g.position
         contact = max(
-            contact, abs(gap @ support.normal) if g.free else float(np.linalg.norm(gap))
+            contact,
+            abs(gap @ support.normal)
+            if isinstance(x, Sliding)
+            else float(np.linalg.norm(gap)),
         )
     hull = ConvexHull(np.concatenate(points)[:, :2])
     com = data.subtree_com[m.body("Waist").id]
@@ -1067,7 +1087,7 @@ def test_residuals_notice_any_clearance(plain):
     feet = [w.model.geom(f).id for f in ("LFoot", "RFoot")]
     pair = np.isin(w.pairs, feet).all(axis=1)
     problem = stance_problem(plain, clearance=np.where(pair, 0.06, -np.inf))
-    problem = replace(problem, goals=problem.goals[:2])
+    problem = replace(problem, tasks=problem.tasks[:2])
     r = plain.residuals(problem, w.home)
     assert r.distance == pytest.approx(0.06 - 0.0452, abs=1e-6)
     assert pair[r.worst_pair]
@@ -1084,13 +1104,8 @@ def test_limits_that_are_exceeded_are_measured(plain):
 
 
 def test_a_contact_out_of_reach_is_unreachable(plain):
-    far = ContactGoal(
-        surface="LHand",
-        support="box",
-        position=np.array([1.2, 0.5, 0.275]),
-        rotation=np.eye(3),
-    )
-    problem = stance_problem(plain, goals=(*stance_problem(plain).goals[:2], far))
+    far = Closed(contact=hand_on_box(1.2, 0.5), rotation=np.eye(3))
+    problem = stance_problem(plain, tasks=(*stance_problem(plain).tasks[:2], far))
     solution = plain.solve(problem, plain.world.home)
     assert solution.status is Status.UNREACHABLE
     truth = measured(plain.world, problem, solution.q)
@@ -1100,12 +1115,10 @@ def test_a_contact_out_of_reach_is_unreachable(plain):
 
 def test_a_margin_that_no_stance_has_is_unbalanced(plain):
     w = plain.world
-    feet = stance_problem(plain).goals[:2]
-    clearance = contact_clearance(
-        w, base_clearance(w, 0.01), {"LFoot": "ground", "RFoot": "ground"}
-    )
+    feet = stance_problem(plain).tasks[:2]
+    clearance = contact_clearance(w, 0.01, {"LFoot": "ground", "RFoot": "ground"})
     problem = stance_problem(
-        plain, goals=feet, clearance=clearance, balance_margin=0.15
+        plain, tasks=feet, clearance=clearance, balance_margin=0.15
     )
     solution = plain.solve(problem, w.home)
     assert solution.status is Status.UNBALANCED
@@ -1115,11 +1128,11 @@ def test_a_margin_that_no_stance_has_is_unbalanced(plain):
 
 def test_feet_that_must_stand_too_close_collide(plain):
     w = plain.world
-    left, right, _ = stance_problem(plain).goals
-    near = replace(left, position=right.position + np.array([0.0, 0.08, 0.0]))
+    left, right, _ = stance_problem(plain).tasks
+    near = beside(left, right, 0.08)
     where = {"LFoot": "ground", "RFoot": "ground"}
-    clearance = contact_clearance(w, base_clearance(w, 0.01), where)
-    problem = stance_problem(plain, goals=(near, right), clearance=clearance)
+    clearance = contact_clearance(w, 0.01, where)
+    problem = stance_problem(plain, tasks=(near, right), clearance=clearance)
     solution = plain.solve(problem, w.home)
     # Feet that overlap satisfy neither: whichever gives way, it is not called solved.
     assert solution.status in (Status.COLLIDING, Status.UNREACHABLE)
@@ -1128,10 +1141,10 @@ def test_feet_that_must_stand_too_close_collide(plain):
 
 
 def test_where_nothing_satisfies_all_no_step_is_left_that_would_help(plain):
-    left, right, hand = stance_problem(plain).goals
+    left, right, hand = stance_problem(plain).tasks
     for shift in (0.03, 0.06, 0.09):
-        near = replace(left, position=right.position + np.array([0.0, shift, 0.0]))
-        problem = stance_problem(plain, goals=(near, right, hand))
+        near = beside(left, right, shift)
+        problem = stance_problem(plain, tasks=(near, right, hand))
         solution = plain.solve(problem, plain.world.home)
         assert solution.status is not Status.SOLVED
         qp = plain.build(problem, solution.q)
@@ -1156,12 +1169,12 @@ def test_asking_leaves_question_and_start_as_they_were(plain):
     w = plain.world
     problem = stance_problem(plain)
     home, clearance = w.home.copy(), problem.clearance.copy()
-    positions = [g.position.copy() for g in problem.goals]
+    positions = [x.contact.position.copy() for x in problem.tasks]
     plain.solve_hard(problem, w.home)
     np.testing.assert_array_equal(w.home, home)
     np.testing.assert_array_equal(problem.clearance, clearance)
-    for g, p in zip(problem.goals, positions, strict=True):
-        np.testing.assert_array_equal(g.position, p)
+    for x, p in zip(problem.tasks, positions, strict=True):
+        np.testing.assert_array_equal(x.contact.position, p)
 
 
 def test_a_solved_posture_stays_solved_wherever_the_world_is_turned(rng):
@@ -1179,17 +1192,16 @@ def test_a_solved_posture_stays_solved_wherever_the_world_is_turned(rng):
     scene = Scene(boxes=(turned,), start=np.array([*at, yaw]))
     there = IK(build_world(load_robot("coman"), scene))
     problem = stance_problem(here)
-    moved = stance_problem(
+    other = stance_problem(
         there,
         directions={n: R @ u for n, u in problem.directions.items()},
     )
-    hand = problem.goals[2]
-    moved_hand = replace(
-        hand, position=R @ hand.position + [*at, 0.0], rotation=R @ hand.rotation
-    )
-    moved = replace(moved, goals=(*moved.goals[:2], moved_hand))
+    hand = problem.tasks[2]
+    p = hand.contact.position
+    hand = moved(hand, R @ p + [*at, 0.0] - p, R)
+    other = replace(other, tasks=(*other.tasks[:2], hand))
     a = here.solve(problem, here.world.home)
-    b = there.solve(moved, there.world.home)
+    b = there.solve(other, there.world.home)
     assert a.status is b.status is Status.SOLVED
     np.testing.assert_allclose(a.q[7:], b.q[7:], atol=2e-3)
     assert a.residuals.com_margin == pytest.approx(b.residuals.com_margin, abs=1e-3)
@@ -1197,12 +1209,8 @@ def test_a_solved_posture_stays_solved_wherever_the_world_is_turned(rng):
 
 def test_solve_hard_never_does_worse(plain):
     for x in (0.36, 0.5, 0.62):
-        hand = replace(
-            stance_problem(plain).goals[2],
-            position=np.array([x, -0.05, 0.275]),
-            free=False,
-        )
-        problem = stance_problem(plain, goals=(*stance_problem(plain).goals[:2], hand))
+        hand = Closed(contact=hand_on_box(x, -0.05), rotation=np.eye(3))
+        problem = stance_problem(plain, tasks=(*stance_problem(plain).tasks[:2], hand))
         easy = plain.solve(problem, plain.world.home)
         hard = plain.solve_hard(problem, plain.world.home)
         assert hard.residuals.worst <= easy.residuals.worst
@@ -1220,10 +1228,10 @@ def test_a_hint_is_where_a_hard_solve_begins(plain):
 
 def test_a_leap_that_does_not_pay_off_is_taken_back(plain):
     """From a posture that is good already, a solve never ends in a worse one."""
-    left, right, hand = stance_problem(plain).goals
+    left, right, hand = stance_problem(plain).tasks
     for shift in (0.03, 0.06, 0.09):
-        near = replace(left, position=right.position + np.array([0.0, shift, 0.0]))
-        problem = stance_problem(plain, goals=(near, right, hand))
+        near = beside(left, right, shift)
+        problem = stance_problem(plain, tasks=(near, right, hand))
         q = plain.solve(problem, plain.world.home).q
         before = plain.build(problem, q).merit
         assert plain.build(problem, plain.solve(problem, q).q).merit <= before + 1e-9
@@ -1251,28 +1259,17 @@ def test_kinematics_of_the_workspace_are_left_at_the_posture(ik):
     np.testing.assert_array_equal(ik.kin.com, fresh.com)
 
 
-def test_held_contacts_are_the_same_whatever_problem_came_before(plain):
-    """Rows of round contacts are made together, and kept while a problem is solved."""
+def test_round_contacts_are_the_same_whatever_problem_came_before(plain):
+    """Tasks are kept while a problem is solved, and no longer."""
     w, q = plain.world, bent(plain.world, 4)
-    plain.kin.update(q)
     names = ("LKnee", "RKnee", "LElbow", "RElbow")
     problems = []
     for held in (names[:2], names[1:], names):
-        goals = []
-        for name in held:
-            s = w.surfaces[name]
-            p = plain.kin.contact_point(name, np.array([0.0, 0.0, 1.0]))
-            link = quat_from_matrix(plain.kin.rotation(s.body))
-            goals.append(
-                ContactGoal(
-                    surface=name,
-                    support="box",
-                    position=p + 0.01,
-                    rotation=np.eye(3),
-                    link=link,
-                )
-            )
-        problems.append(problem_of(w, *goals, balance=True))
+        tasks = [
+            moved(task_at(plain, q, name, "box", link=True), np.full(3, 0.01))
+            for name in held
+        ]
+        problems.append(problem_of(w, *tasks, balance=True))
     later = plain.kin.integrate(q, np.full(w.model.nv, 0.05))
     for problem in (*problems, *problems[::-1]):
         for posture in (q, later, q):
@@ -1284,7 +1281,7 @@ def test_held_contacts_are_the_same_whatever_problem_came_before(plain):
     qp = plain.build(problems[-1], q)
     np.testing.assert_allclose(qp.e, 0.01, atol=1e-9)
     A, b = w.supports["box"].edges()
-    for g in problems[-1].goals:
-        p = plain.kin.contact_point(g.surface, w.supports["box"].normal)
+    for name in names:
+        p = plain.kin.contact_point(name, w.supports["box"].normal)
         room = b - EDGE_INSET - A @ p
         assert all(np.isclose(qp.hi, x).any() for x in room[room < 0.15])

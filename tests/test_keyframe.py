@@ -17,7 +17,7 @@ from clamber.model.se3 import matrix_from_rpy, quat_from_matrix
 from clamber.model.world import World, build_world
 from clamber.step import direct, gradient, lbfgs
 from clamber.step.alternating import Alternation
-from clamber.step.ik import EDGE_INSET, IK, ContactGoal
+from clamber.step.ik import IK
 from clamber.step.posture import (
     Keyframe,
     KeyframeOptions,
@@ -25,7 +25,7 @@ from clamber.step.posture import (
     finish,
     keyframe_problem,
     new_positions,
-    prescribed_goals,
+    prescribed,
     stability_cost,
 )
 from clamber.step.stability import (
@@ -37,6 +37,7 @@ from clamber.step.stability import (
     torque_limits,
 )
 from clamber.step.statics import GRAVITY, ContactPoints
+from clamber.step.tasks import EDGE_INSET, Closed, Sliding
 
 METHODS = {"direct": direct, "lbfgs": lbfgs, "gradient": gradient}
 OUTER = {"lbfgs": lbfgs, "gradient": gradient}
@@ -417,17 +418,14 @@ def test_a_fixed_contact_stays_where_it_is_said_to_be(ik):
 def test_a_keyframes_problem_holds_what_it_held_and_closes_what_is_new(ik):
     hand = on_box("LHand", 0.43, 0.17)
     task = task_of(ik, hand)
-    goals = prescribed_goals(ik.world, task, np.array([[0.4, 0.1, 0.275]]))
-    problem = keyframe_problem(ik.world, task, KeyframeOptions(), goals)
-    left, right, new = problem.goals
-    for goal, c in zip((left, right), task.held, strict=True):
-        assert isinstance(goal, ContactGoal)
-        assert goal.hard
-        assert not goal.free
-        np.testing.assert_array_equal(goal.position, c.position)
-    assert new.hard
-    assert new.free
-    np.testing.assert_array_equal(new.position, [0.4, 0.1, 0.275])
+    tasks = prescribed(ik.world, task, np.array([[0.4, 0.1, 0.275]]))
+    problem = keyframe_problem(ik.world, task, KeyframeOptions(), tasks)
+    left, right, new = problem.tasks
+    for foot, c in zip((left, right), task.held, strict=True):
+        assert isinstance(foot, Closed)
+        assert foot.contact is c
+    assert isinstance(new, Sliding)
+    np.testing.assert_array_equal(new.contact.position, [0.4, 0.1, 0.275])
     name = ik.world.model.geom
     may_touch = {
         frozenset(name(int(g)).name for g in pair)

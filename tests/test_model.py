@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clamber.errors import InputError
-from clamber.model.kinematics import Balls, Kinematics, limb_lengths
+from clamber.model.kinematics import Kinematics, limb_lengths
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import GROUND, Box, Scene
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
@@ -796,30 +796,6 @@ def test_a_flat_error_is_the_turn_that_would_lay_it_flat(world):
 
 
 # Distances that are not looked at.
-
-
-def test_balls_together_are_where_they_are_alone(tilted):
-    kin, q = Kinematics(tilted), random_posture(tilted, 3)
-    kin.update(q)
-    names = [n for n, s in tilted.surfaces.items() if not s.is_flat]
-    surfaces = [tilted.surfaces[n] for n in names]
-    links = [quat_from_matrix(kin.rotation(s.body)) for s in surfaces]
-    normal = matrix_from_rpy([0.2, -0.3, 0.0])[:, 2]
-    balls = Balls(
-        bodies=np.array([s.body for s in surfaces]),
-        centres=np.array([s.centre for s in surfaces])[:, :, None],
-        radii=np.array([[s.radius] for s in surfaces]),
-        normals=np.array([normal] * len(names)),
-        links=np.array(links),
-    )
-    rng = np.random.default_rng(2)
-    for _ in range(20):
-        q = kin.integrate(q, 0.2 * rng.normal(size=tilted.model.nv))
-        kin.update(q)
-        points, rolled = kin.rolled(balls)
-        for i, name in enumerate(names):
-            np.testing.assert_array_equal(points[i], kin.contact_point(name, normal))
-            np.testing.assert_array_equal(rolled[i], kin.roll(name, normal, links[i]))
 
 
 @pytest.mark.parametrize("seed", SEEDS)

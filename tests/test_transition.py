@@ -267,7 +267,7 @@ def test_the_ellipse_task_pulls_the_centre_of_mass_into_the_ellipse(ik, transiti
 
     def excess(**weight: float) -> float:
         problem = balance_problem(
-            ik.world, held=t.held, closed=t.rolling, q_reference=t.before
+            ik.world, held=t.held, unloaded=t.rolling, q_reference=t.before
         )
         problem = replace(problem, com_weight=0.0, balance_margin=0.0, **weight)
         solution = ik.solve_hard(problem, t.before)

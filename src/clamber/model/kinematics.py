@@ -23,25 +23,6 @@ _ONES = np.ones(9)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Balls:
-    """Round surfaces that roll on supports, K of them, to be looked at together.
-
-    Attributes:
-        bodies: (K,) ids; centres: (K, 3, 1) in their frames; radii: (K, 1) [m].
-        normals: (K, 3) of the supports.
-        links: (K, 4) orientation of each link where its contact was taken.
-    """
-
-    bodies: np.ndarray
-    centres: np.ndarray
-    radii: np.ndarray
-    normals: np.ndarray
-    links: np.ndarray
-
-    __repr__ = short_repr
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proximity:
     """Pairs nearer than the range asked for.
 
@@ -221,16 +202,6 @@ class Kinematics:
         x, y, z = (s.radius * (self.rotation(s.body) @ self._turn)).tolist()
         nx, ny, nz = normal.tolist()
         return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
-
-    def rolled(self, balls: Balls) -> tuple[np.ndarray, np.ndarray]:
-        """(K, 3) `contact_point` and (K, 3) `roll` of all of them."""
-        R, n = self._xmat.take(balls.bodies, axis=0), balls.normals
-        turns = np.empty((len(n), 3, 1))
-        for turn, body, link in zip(turns, balls.bodies, balls.links, strict=True):
-            mujoco.mju_subQuat(turn[:, 0], self._xquat[body], link)
-        x = self._xpos.take(balls.bodies, axis=0)
-        p = x + (R @ balls.centres)[:, :, 0] - balls.radii * n
-        return p, _cross(balls.radii * (R @ turns)[:, :, 0], n)
 
     def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
         """(3,) world rotation vector from the surface's frame to the contact frame."""

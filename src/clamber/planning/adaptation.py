@@ -33,11 +33,12 @@ from clamber.planning.trajectory import (
 from clamber.planning.traverse import follow_policy
 from clamber.step import direct
 from clamber.step.change import Failure, standing
-from clamber.step.ik import IK, NO_WARINESS, ContactGoal, Wary, support_rotation
+from clamber.step.ik import IK, NO_EXTRA, ExtraClearance
 from clamber.step.path import ARC_WEIGHT, Phase, bridge
 from clamber.step.posture import Keyframe, KeyframeTask
 from clamber.step.stability import contact_points
 from clamber.step.statics import com_margin, support_polygon
+from clamber.step.tasks import reaching, support_rotation
 from clamber.step.transition import balance_problem
 
 REACH = 0.12  # [m] a contact is looked for this far from where it was planned
@@ -71,7 +72,7 @@ def adapt_plan(
     scene: Scene,
     now: State,
     commanded: np.ndarray,
-    wary: Wary = NO_WARINESS,
+    wary: ExtraClearance = NO_EXTRA,
 ) -> Plan:
     """Take a stance as it is and plan the steps that are left.
 
@@ -89,7 +90,7 @@ def adapt_plan(
     found = _adapt(plan, scene, now, commanded, wary)
     if found.failures and (wary or any(b.roughness > 0 for b in scene.boxes)):
         smooth = tuple(replace(b, roughness=0.0) for b in scene.boxes)
-        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NO_WARINESS)
+        other = _adapt(plan, replace(scene, boxes=smooth), now, commanded, NO_EXTRA)
         return _farther(found, other)
     return found
 
@@ -101,7 +102,7 @@ def _farther(found: Plan, other: Plan) -> Plan:
 
 
 def _adapt(
-    plan: Plan, scene: Scene, now: State, commanded: np.ndarray, wary: Wary
+    plan: Plan, scene: Scene, now: State, commanded: np.ndarray, wary: ExtraClearance
 ) -> Plan:
     ik = IK(build_world(plan.world.robot, scene), wary)
     key, lead = settle(ik, now, commanded, plan.options)
@@ -125,7 +126,7 @@ def settle(
     problem = balance_problem(
         world,
         held=now.loaded,
-        closed=tuple(c for c in now.stance if c not in now.loaded),
+        unloaded=tuple(c for c in now.stance if c not in now.loaded),
         q_reference=now.q,
         posture_weight=1.0,
         margin=0.005,
@@ -163,7 +164,9 @@ def start_again(plan: Plan, scene: Scene) -> Plan:
     return _rest(plan, ik, standing(ik, plan.options.keyframe))
 
 
-def go_on(plan: Plan, world: World, key: Keyframe, wary: Wary = NO_WARINESS) -> Plan:
+def go_on(
+    plan: Plan, world: World, key: Keyframe, wary: ExtraClearance = NO_EXTRA
+) -> Plan:
     """A policy followed on from the last keyframe of what was planned ahead.
 
     Args:
@@ -343,14 +346,7 @@ def _node_below(
     """The posture near `q` with a contact at `wanted` (3,), and how far it is short."""
     world = ik.world
     support = world.supports[contact.support]
-    goal = ContactGoal(
-        surface=contact.surface,
-        support=contact.support,
-        position=wanted,
-        rotation=support_rotation(support, contact.quaternion),
-        hard=False,
-        reference=ARC_WEIGHT,
-    )
+    goal = reaching(world, contact, wanted, weight=ARC_WEIGHT)
     problem = balance_problem(
         world,
         held=held,

@@ -40,8 +40,9 @@ from clamber.planning.records import (
 )
 from clamber.planning.route import Frame, contact_at
 from clamber.step.change import Change, Failure, change_contact, home_at, standing
-from clamber.step.ik import IK, PostureProblem, base_clearance, contact_clearance
-from clamber.step.posture import CLEARANCE, Keyframe, held_goal
+from clamber.step.ik import IK, PostureProblem, contact_clearance
+from clamber.step.posture import CLEARANCE, Keyframe
+from clamber.step.tasks import closed
 
 # Manoeuvres in a row that bring the goal nearer by less than the second [m] are given
 # up: to turn around on the spot takes 13.
@@ -331,7 +332,7 @@ def quadrupedal_posture(ik: IK, gait: Gait) -> np.ndarray:
     # The robot keeps off itself; the scene does not count.
     own = (world.model.geom_bodyid[world.pairs] > 0).all(axis=1)
     problem = PostureProblem(
-        goals=tuple(held_goal(world, c) for c in contacts),
+        tasks=tuple(closed(world, c) for c in contacts),
         q_reference=world.home,
         clearance=np.where(own, CLEARANCE, -np.inf),
         base_rotation=held,
@@ -351,9 +352,9 @@ def upright_posture(ik: IK, key: Keyframe, new: Contact) -> np.ndarray:
     stance.append(new)
     where = {c.surface: c.support for c in stance}
     problem = PostureProblem(
-        goals=tuple(held_goal(world, c) for c in stance),
+        tasks=tuple(closed(world, c) for c in stance),
         q_reference=key.q,
-        clearance=contact_clearance(world, base_clearance(world, CLEARANCE), where),
+        clearance=contact_clearance(world, CLEARANCE, where),
         com_target=middle_of(world, stance),
         com_weight=OVER_MIDDLE,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clamber.step.ik import EDGE_INSET, IK
+from clamber.step.ik import IK
 from clamber.step.posture import (
     Keyframe,
     KeyframeOptions,
@@ -17,9 +17,10 @@ from clamber.step.posture import (
     finish,
     keyframe_problem,
     new_positions,
-    prescribed_goals,
+    prescribed,
     stability_cost,
 )
+from clamber.step.tasks import EDGE_INSET
 
 INNER_ITERATIONS = 12  # QPs between two updates of the contacts, warm
 
@@ -102,8 +103,8 @@ class Alternation:
 
     def _solve(self, x: np.ndarray) -> np.ndarray:
         positions = self.positions(self.clip(x))
-        goals = prescribed_goals(self.ik.world, self.task, positions)
-        problem = keyframe_problem(self.ik.world, self.task, self.options, goals)
+        tasks = prescribed(self.ik.world, self.task, positions)
+        problem = keyframe_problem(self.ik.world, self.task, self.options, tasks)
         if np.isinf(self.lowest):
             return self.ik.solve_hard(problem, self.q).q
         return self.ik.solve(problem, self.q, iterations=INNER_ITERATIONS).q

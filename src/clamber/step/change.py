@@ -16,7 +16,7 @@ from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
 from clamber.model.world import World
 from clamber.step import direct, gradient, lbfgs
-from clamber.step.ik import IK, support_rotation
+from clamber.step.ik import IK
 from clamber.step.path import Phase, plan_path
 from clamber.step.posture import (
     Keyframe,
@@ -25,6 +25,7 @@ from clamber.step.posture import (
     finish,
 )
 from clamber.step.stability import limiting_joint
+from clamber.step.tasks import support_rotation
 from clamber.step.transition import (
     MARGINS,
     approach_contact,

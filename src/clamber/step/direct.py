@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from clamber.step.ik import IK, ContactGoal, support_rotation
+from clamber.step.ik import IK
 from clamber.step.posture import (
     Keyframe,
     KeyframeOptions,
     KeyframeTask,
     finish,
-    held_goal,
     keyframe_problem,
     stability_cost,
 )
+from clamber.step.tasks import closed, sliding
 
 
 def optimise(
@@ -29,21 +29,18 @@ def optimise(
     ik.kin.update(q)
     references = np.array([c.position for c in task.new]).reshape(-1, 3)
     before, _ = stability_cost(ik.kin, task, references, options.stability_weight)
-    goals = tuple(
-        held_goal(world, c)
+    tasks = tuple(
+        closed(world, c)
         if task.fixed
-        else ContactGoal(
-            surface=c.surface,
-            support=c.support,
-            position=c.position,
-            rotation=support_rotation(world.supports[c.support], c.quaternion),
-            free=True,
+        else sliding(
+            world,
+            c,
+            options.reference_weight,
             stability=options.stability_weight,
-            reference=options.reference_weight,
         )
         for c in task.new
     )
-    solution = ik.solve_hard(keyframe_problem(world, task, options, goals), q)
+    solution = ik.solve_hard(keyframe_problem(world, task, options, tasks), q)
     return finish(
         ik,
         task,

@@ -20,8 +20,9 @@ from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Support
 from clamber.model.world import World
-from clamber.step.ik import IK, ContactGoal, PostureProblem, support_rotation
+from clamber.step.ik import IK, PostureProblem
 from clamber.step.stability import contact_drift, is_stable, limiting_joint
+from clamber.step.tasks import reaching
 from clamber.step.transition import CLEARANCE, Transition, balance_problem
 
 SAFE_HEIGHT = 0.05  # [m] h_safe of (4.29)
@@ -215,7 +216,7 @@ def bridge(
         problem = balance_problem(
             ik.world,
             held=tuple(c for c in contacts if c.surface in bearing),
-            closed=tuple(c for c in contacts if c.surface not in bearing),
+            unloaded=tuple(c for c in contacts if c.surface not in bearing),
             q_reference=q,
             posture_weight=1.0,
         )
@@ -244,23 +245,16 @@ def _swing(ik: IK, t: Transition, adapt: bool) -> tuple[np.ndarray, np.ndarray]:
     top = highest(support, p1, made.position)
     control = arc(p1, made.position, top, slides, ARC_POINTS)
     shares = np.linspace(0.0, 1.0, len(control))
-    rotation = support_rotation(support, made.quaternion)
 
     def node(share: float, last: np.ndarray, between: bool) -> np.ndarray:
-        goal = ContactGoal(
-            surface=made.surface,
-            support=made.support,
-            position=np.array([np.interp(share, shares, x) for x in control.T]),
-            rotation=rotation,
-            hard=False,
-            reference=LOOSE_ARC_WEIGHT if between else ARC_WEIGHT,
-        )
+        at = np.array([np.interp(share, shares, x) for x in control.T])
+        weight = LOOSE_ARC_WEIGHT if between else ARC_WEIGHT
         reference = last if between else interpolate(kin, t.shifted, t.touching, share)
         problem = balance_problem(
             world,
             held=t.held,
             q_reference=reference,
-            extra=(goal,),
+            extra=(reaching(world, made, at, weight=weight),),
             posture_weight=1.0 if between else 0.3,
             margin=t.margin if made else BRIDGE_MARGIN,
         )

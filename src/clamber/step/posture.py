@@ -12,7 +12,7 @@ posture that closes every contact, balanced and free of collisions.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -24,15 +24,13 @@ from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
 from clamber.step.ik import (
     IK,
-    ContactGoal,
     PostureProblem,
     Residuals,
-    base_clearance,
     contact_clearance,
-    support_rotation,
 )
 from clamber.step.stability import ContactState, contact_state, equilibrium_at
 from clamber.step.statics import StaticEquilibrium
+from clamber.step.tasks import SurfaceTask, closed, sliding, support_rotation
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
 CLEARANCE = 0.010  # [m] p_safe: between links, and between links and the scene
@@ -111,34 +109,19 @@ class Keyframe:
         return tuple(c.contact for c in self.contacts)
 
 
-def held_goal(world: World, c: Contact, *, loaded: bool = True) -> ContactGoal:
-    """A contact that keeps its place."""
-    return ContactGoal(
-        surface=c.surface,
-        support=c.support,
-        position=c.position,
-        rotation=support_rotation(world.supports[c.support], c.quaternion),
-        loaded=loaded,
-        edge=c.edge,
-        link=c.link,
-    )
-
-
 def keyframe_problem(
     world: World,
     task: KeyframeTask,
     options: KeyframeOptions,
-    new: tuple[ContactGoal, ...],
+    new: tuple[SurfaceTask, ...],
 ) -> PostureProblem:
-    """The posture problem of a stance, with `new` as goals of the new contacts."""
+    """The posture problem of a stance, with `new` as tasks of the new contacts."""
     where = {c.surface: c.support for c in (*task.held, *task.new)}
     rolling = [c.surface for c in task.held if c.edge is not None]
     return PostureProblem(
-        goals=(*(held_goal(world, c) for c in task.held), *new),
+        tasks=(*(closed(world, c) for c in task.held), *new),
         q_reference=task.q_reference,
-        clearance=contact_clearance(
-            world, base_clearance(world, CLEARANCE), where, rolling
-        ),
+        clearance=contact_clearance(world, CLEARANCE, where, rolling),
         directions=task.directions,
         direction_weight=options.direction_weight,
         base_rotation=task.base_rotation,
@@ -146,19 +129,12 @@ def keyframe_problem(
     )
 
 
-def prescribed_goals(
+def prescribed(
     world: World, task: KeyframeTask, positions: np.ndarray
-) -> tuple[ContactGoal, ...]:
+) -> tuple[SurfaceTask, ...]:
     """New contacts wanted at `positions` (n, 3), closed on their supports."""
     return tuple(
-        ContactGoal(
-            surface=c.surface,
-            support=c.support,
-            position=p,
-            rotation=support_rotation(world.supports[c.support], c.quaternion),
-            free=True,
-            reference=HOLD_WEIGHT,
-        )
+        sliding(world, replace(c, position=p), HOLD_WEIGHT)
         for c, p in zip(task.new, positions, strict=True)
     )
 

@@ -19,16 +19,14 @@ from clamber.errors import Status
 from clamber.model.world import World
 from clamber.step.ik import (
     IK,
-    ContactGoal,
     PostureProblem,
     Residuals,
     Solution,
-    base_clearance,
     contact_clearance,
-    support_rotation,
 )
-from clamber.step.posture import CLEARANCE, Keyframe, held_goal
+from clamber.step.posture import CLEARANCE, Keyframe
 from clamber.step.stability import is_stable, limiting_joint
+from clamber.step.tasks import SurfaceTask, closed, sliding
 
 REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
 MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
@@ -129,37 +127,35 @@ def balance_problem(
     world: World,
     *,
     held: tuple[Contact, ...],
-    closed: tuple[Contact, ...] = (),
+    unloaded: tuple[Contact, ...] = (),
     q_reference: np.ndarray,
-    extra: tuple[ContactGoal, ...] = (),
+    extra: tuple[SurfaceTask, ...] = (),
     posture_weight: float = 0.08,
     touching: Mapping[str, str] | None = None,
     margin: float = MARGINS[-1],
 ) -> PostureProblem:
-    """Balance on `held`, with `closed` in contact but not loaded.
+    """Balance on `held`, with `unloaded` in contact but not loaded.
 
     Args:
         world: Robot and scene.
         held: Contacts that bear load.
-        closed: Contacts that do not.
+        unloaded: Contacts that do not.
         q_reference: (nq,) preferred posture.
-        extra: Further goals.
+        extra: Further tasks.
         posture_weight: Of the preferred posture.
         touching: Support by surface, of what may touch besides.
         margin: Of the centre of mass to the border of its polygon [m].
     """
-    where = {c.surface: c.support for c in (*held, *closed)} | dict(touching or {})
-    rolling = [c.surface for c in (*held, *closed) if c.edge is not None]
+    where = {c.surface: c.support for c in (*held, *unloaded)} | dict(touching or {})
+    rolling = [c.surface for c in (*held, *unloaded) if c.edge is not None]
     return PostureProblem(
-        goals=(
-            *(held_goal(world, c) for c in held),
-            *(held_goal(world, c, loaded=False) for c in closed),
+        tasks=(
+            *(closed(world, c) for c in held),
+            *(closed(world, c, loaded=False) for c in unloaded),
             *extra,
         ),
         q_reference=q_reference,
-        clearance=contact_clearance(
-            world, base_clearance(world, CLEARANCE), where, rolling
-        ),
+        clearance=contact_clearance(world, CLEARANCE, where, rolling),
         balance_margin=margin,
         posture_weight=posture_weight,
         ellipse_weight=ELLIPSE_WEIGHT,
@@ -193,7 +189,7 @@ def plan_transition(
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
     shift = ik.solve_hard(
         balance_problem(
-            world, held=held, closed=rolling, q_reference=before.q, margin=margin
+            world, held=held, unloaded=rolling, q_reference=before.q, margin=margin
         ),
         before.q,
         hint=step.seeds.shifted,
@@ -248,7 +244,7 @@ def _touch(
     problem = balance_problem(
         world,
         held=held,
-        closed=(made,),
+        unloaded=(made,),
         q_reference=0.5 * (shifted + after),
         margin=margin,
     )
@@ -285,12 +281,12 @@ def eased_contacts(
     leaving = tuple(c for c in before.stance if c.surface in step.breaks)
     middle = np.mean([c.position for c in (*held, *moved)], axis=0)
     rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
-    free = tuple(_free_goal(ik, c, 1.0) for c in moved)
+    free = tuple(sliding(ik.world, c, 1.0) for c in moved)
     touching = {c.surface: c.support for c in moved}
     shift = balance_problem(
         ik.world,
         held=held,
-        closed=rolling,
+        unloaded=rolling,
         q_reference=before.q,
         extra=free,
         touching=touching,
@@ -303,7 +299,7 @@ def eased_contacts(
             ik.world,
             held=tuple(rolled(ik, before.q, c, at) for c in held),
             q_reference=before.q,
-            extra=(*free, _free_goal(ik, new, 1.0, loaded=False)),
+            extra=(*free, sliding(ik.world, new, 1.0, loaded=False)),
             touching=touching | {new.surface: new.support},
             margin=margin,
         )
@@ -319,21 +315,6 @@ def eased_contacts(
         ):
             return eased, Seeds(**{posture: solution.q})
     return None
-
-
-def _free_goal(
-    ik: IK, c: Contact, reference: float, *, loaded: bool = True
-) -> ContactGoal:
-    """Closed on its support, near where it is wanted."""
-    return ContactGoal(
-        surface=c.surface,
-        support=c.support,
-        position=c.position,
-        rotation=support_rotation(ik.world.supports[c.support], c.quaternion),
-        free=True,
-        loaded=loaded,
-        reference=reference,
-    )
 
 
 def _touching_at(ik: IK, c: Contact) -> Contact:
@@ -366,7 +347,7 @@ def approach_contact(
         ik.world,
         held=held,
         q_reference=q,
-        extra=(_free_goal(ik, wanted, APPROACH_WEIGHT, loaded=False),),
+        extra=(sliding(ik.world, wanted, APPROACH_WEIGHT, loaded=False),),
         touching={wanted.surface: wanted.support},
     )
     solution = ik.solve_hard(problem, q, hint=hint)
