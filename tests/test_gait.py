@@ -118,7 +118,7 @@ class Obstinate:
 
     def __init__(self, gait: Gait, stance, refused=lambda c: True) -> None:
         self.gait, self.refused, self.asked = gait, refused, []
-        self.here = Outcome(stance=stance, q=gait.world.home)
+        self.here = Outcome(key=SimpleNamespace(stance=stance, q=gait.world.home))
 
     def pursue(self):
         """What comes next, and why nothing; all that was asked is kept."""
@@ -126,7 +126,8 @@ class Obstinate:
 
     def attempt(self, proposal: Proposal | Climb) -> Outcome:
         self.asked.append(proposal)
-        stance, changes, left = self.here.stance, [], []
+        stance, changes = proposal.after.stance, [*proposal.after.changes]
+        left = []
         if isinstance(proposal, Climb):
             if proposal.start is not None:
                 *xy, yaw = proposal.start
@@ -134,7 +135,6 @@ class Obstinate:
                 stance = on_feet(*feet, yaw)
             rows = [(s.limb, s.breaks, (s.makes,), o) for s, o in proposal.steps]
         else:
-            stance, changes = proposal.after.stance, [*proposal.after.changes]
             rows = [
                 (x.name, x.surfaces, g.contacts, g.option)
                 for g in proposal.goals
@@ -153,8 +153,7 @@ class Obstinate:
         if isinstance(proposal, Climb) and (left or not rows):
             changes, left = [], left or ["-"]
         return Outcome(
-            stance=stance,
-            q=self.here.q,
+            key=SimpleNamespace(stance=stance, q=self.here.key.q),
             changes=tuple(changes),
             left=tuple(left),
             failure=Failure(status=Status.STUCK) if left else None,

@@ -244,7 +244,7 @@ class Gait:
         """The next contacts of a flight of stairs, or all that is left of a climb."""
         wanted = self._next_treads(at, platform)
         if not wanted:
-            yield Climb(steps=self._left_of_ascent(at, platform))
+            yield Climb(after=at, steps=self._left_of_ascent(at, platform))
             return
         # Where not all of a pair get to their places, all go to their next best.
         some, options = None, self.policy.options
@@ -310,7 +310,7 @@ class Gait:
         assert edge is not None
         ankles = self.ankles(Frame.behind(edge, -self.build.stand))
         ascent = self._ascent(edge, platform)
-        up = yield Climb(steps=ascent, start=ankles, accept="never")
+        up = yield Climb(after=at, steps=ascent, start=ankles, accept="never")
         if up.failure:
             return
         here = self._by_limb(at)
@@ -322,7 +322,7 @@ class Gait:
                 if step.makes is not None:
                     on[step.limb] = step.makes.surface
                 steps.append((step, option))
-        yield Climb(steps=steps)
+        yield Climb(after=at, steps=steps)
         if not steps or any(c.support == GROUND for c in at.stance):
             return
         body, goals = self.quadrupedal_frame(up.stance), []
@@ -383,7 +383,7 @@ class Gait:
             limb = self.world.robot.limb_of(surface).name
             if limb in on:
                 continue
-            self._kin.update(at.q)
+            self._kin.update(at.key.q)
             here = self._kin.contact_point(surface, np.array([0.0, 0.0, 1.0]))[:2]
             contacts = (
                 self.place(platform, surface, frame, self.build.offsets[limb]),
@@ -596,7 +596,7 @@ class Gait:
         name, point = found or (boxes[0], np.array([*wanted, 0.0]))
         return contact_at(surface, self.world.supports[name], point, body.yaw)
 
-    def pelvis(self, at: Outcome | Keyframe, body: Frame) -> np.ndarray | None:
+    def pelvis(self, key: Keyframe, body: Frame) -> np.ndarray | None:
         """(3, 3) how the pelvis should be held [algorithm 3, step 14]; None: anyhow.
 
         As it is, turned the way that the body faces, its roll within what the policy
@@ -604,12 +604,12 @@ class Gait:
         upper arms, crawls with the hips high, and a robot of another build that is held
         so has its weight on its elbows and cannot lift them.
         """
-        platform = self.platform_of(at.stance)
+        platform = self.platform_of(key.stance)
         if platform is None:
             return None
-        self._kin.update(at.q)
+        self._kin.update(key.q)
         angles = pelvis_angles(self._kin.rotation(self.world.base))
-        position = np.array([*body.xy, at.q[2]])
+        position = np.array([*body.xy, key.q[2]])
         held = pelvis_distribution(
             self.policy, platform.edges, position, near=self.build.thigh
         )

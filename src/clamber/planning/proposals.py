@@ -14,6 +14,7 @@ from clamber.contact.steps import Step
 from clamber.errors import Status
 from clamber.planning.route import Frame
 from clamber.step.change import Change, Failure
+from clamber.step.posture import Keyframe
 
 Accept = Literal["all", "some", "never"]
 
@@ -44,18 +45,21 @@ class Outcome:
     """What came of a proposal, or where a manoeuvre begins.
 
     Attributes:
-        stance: After it.
-        q: (nq,) the posture.
+        key: The keyframe after it.
         changes: Made, with their options; those that the proposal came after first.
         left: Surfaces of goals that could not be made.
         failure: Why the last of them; None: there is none.
     """
 
-    stance: tuple[Contact, ...]
-    q: np.ndarray
+    key: Keyframe
     changes: tuple[tuple[Change, str], ...] = ()
     left: tuple[str, ...] = ()
     failure: Failure | None = None
+
+    @property
+    def stance(self) -> tuple[Contact, ...]:
+        """Of the keyframe."""
+        return self.key.stance
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -86,12 +90,13 @@ class Climb:
     """Steps none of which may be missing; earlier ones are repaired for later ones.
 
     Attributes:
+        after: What it goes on from.
         steps: In order, with their options.
-        start: (3,) x, y, yaw of the ankles' midpoint where it stands; None: from where
-            the robot is.
+        start: (3,) x, y, yaw of the ankles' midpoint where it stands instead, or None.
         accept: As of a `Proposal`.
     """
 
+    after: Outcome
     steps: Sequence[tuple[Step, str]]
     start: np.ndarray | None = None
     accept: Accept = "all"

@@ -156,53 +156,43 @@ class Follower:
         """What is done next, and why nothing; neither where it has arrived."""
 
         def attempt(proposal: Proposal | Climb) -> Outcome:
-            if isinstance(proposal, Climb):
-                return self._climb(key, proposal)
-            return self._make(key, proposal)
+            is_climb = isinstance(proposal, Climb)
+            return self._climb(proposal) if is_climb else self._make(proposal)
 
-        here = Outcome(stance=key.stance, q=key.q)
-        return pursue(self.gait.propose(here), attempt)
+        return pursue(self.gait.propose(Outcome(key=key)), attempt)
 
-    def _climb(self, key: Keyframe, climb: Climb) -> Outcome:
+    def _climb(self, climb: Climb) -> Outcome:
         """All steps of a climb, or none."""
+        start, steps = climb.after.key, [step for step, _ in climb.steps]
         if climb.start is not None:
-            key = standing(self._ik, self.options.keyframe, climb.start)
-        steps = [step for step, _ in climb.steps]
-        route, _ = search_steps(self._ik, key, steps, self.options)
+            start = standing(self._ik, self.options.keyframe, climb.start)
+        route, _ = search_steps(self._ik, start, steps, self.options)
         failure = next(iter(route.failures), None)
         if not steps:
             detail = "nothing is left to climb with"
             failure = Failure(status=Status.STUCK, detail=detail)
-        made = zip(route.changes, (option for _, option in climb.steps), strict=False)
-        return Outcome(
-            stance=route.end.stance,
-            q=route.end.q,
-            changes=() if failure else tuple(made),
-            failure=failure,
-        )
+        if failure is not None:
+            return Outcome(key=route.end, failure=failure)
+        options = (option for _, option in climb.steps)
+        made = zip(route.changes, options, strict=True)
+        return Outcome(key=route.end, changes=tuple(made))
 
-    def _make(self, key: Keyframe, proposal: Proposal) -> Outcome:
+    def _make(self, proposal: Proposal) -> Outcome:
         """The goals of a proposal that can be made."""
-        changes = list(proposal.after.changes)
+        key, changes = proposal.after.key, [*proposal.after.changes]
         left, failure = list(proposal.goals), None
         for how in proposal.rounds:
             goals, left, failure = left, [], None
             for goal in goals:
-                now = changes[-1][0].keyframe if changes else key
-                found = self._reach(now, goal, proposal, how)
+                found = self._reach(key, goal, proposal, how)
                 if isinstance(found, Change):
+                    key = found.keyframe
                     changes.append((found, goal.option))
                 else:
                     left.append(goal)
                     failure = found
-        end = changes[-1][0].keyframe if changes else key
-        return Outcome(
-            stance=end.stance,
-            q=end.q,
-            changes=tuple(changes),
-            left=tuple(g.contacts[0].surface for g in left),
-            failure=failure,
-        )
+        surfaces = tuple(goal.contacts[0].surface for goal in left)
+        return Outcome(key=key, changes=tuple(changes), left=surfaces, failure=failure)
 
     def _reach(
         self, key: Keyframe, goal: Goal, proposal: Proposal, how: Round
