@@ -287,6 +287,22 @@ def test_where_there_is_no_way_down_contacts_move_to_where_there_is(gait):
         np.testing.assert_allclose(to.position, there[to.surface].position)
 
 
+def test_where_not_all_of_a_pair_fit_on_a_tread_both_go_to_their_next_places():
+    gait = gait_in(stairs(3, 0.1, 0.4))
+    feet = [contact(s, 0.51, c.position[1], "s1") for s, c in zip(FEET, on_feet())]  # noqa: B905
+    stance = (contact("LHand", 0.99, 0.17, "s2"), contact("RHand", 0.99, -0.17, "s2"))
+    far, near = proposed(gait, (*feet, *stance), lambda c: c.surface == "LFoot")[:2]
+    assert wanted(far) == wanted(near) == FEET
+    for first, second in zip(far.goals, near.goals, strict=True):
+        x = [c.position[0] for c in (*first.contacts, *second.contacts)]
+        assert len(x) == 2
+        assert x[0] > x[1] > 0.63
+    # Where neither fits, what could be done is kept.
+    able = Obstinate(gait, (*feet, *stance), lambda c: c.surface == "LFoot")
+    changes, _ = able.pursue()
+    assert [change.step.makes.surface for change, _ in changes] == ["RFoot"]
+
+
 # On all fours.
 
 
@@ -407,9 +423,10 @@ def test_over_a_riser_shorter_cycles_and_hands_are_proposed_first():
     shares = [gait.quadrupedal_frame(stance).away(p.body) for p in tries[:12]]
     expected = np.repeat([*RISER_SHARES, *RISER_SHARES], 2) * shares[0]
     np.testing.assert_allclose(shares, expected)
-    hands = [p for p in tries[6:12] for s in wanted(p) if s.endswith("Hand")]
-    assert len(hands) == 12
-    assert not any(s.endswith("Hand") for p in tries[:6] for s in wanted(p))
+    arms = [{s[1:] for s in wanted(p) if s[1:] != "Knee"} for p in tries[:12]]
+    assert arms == [{"Elbow"}] * 6 + [{"Hand"}] * 6
+    legs_first = [wanted(p)[0].endswith("Knee") for p in tries[:12]]
+    assert legs_first == [False, True] * 6
     level = gait_in(row(0.01, 0.5, 0.5))
     assert not level.has_risers(level.platforms[0])
 
