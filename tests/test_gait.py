@@ -16,10 +16,10 @@ from clamber.errors import InputError, Status
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Box, Scene
 from clamber.model.world import build_world
-from clamber.planning.gait import BEFORE_RISER, RISER_SHARES, SAME, SHARES, Gait
+from clamber.planning.gait import BEFORE_RISER, RISER_SHARES, SHARES, Gait
 from clamber.planning.gaps import due_near_gap, gaps_ahead
 from clamber.planning.proposals import FREELY, Climb, Outcome, Proposal, pursue
-from clamber.planning.route import Frame
+from clamber.planning.route import SAME, Frame
 from clamber.step.change import Failure
 from conftest import stairs
 

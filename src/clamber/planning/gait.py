@@ -44,6 +44,7 @@ from clamber.planning.proposals import (
     Accept,
     Climb,
     Goal,
+    Made,
     Manoeuvre,
     Outcome,
     Part,
@@ -53,6 +54,7 @@ from clamber.planning.proposals import (
 from clamber.planning.route import (
     ARRIVED,
     FACING,
+    SAME,
     Frame,
     Platform,
     contact_at,
@@ -62,7 +64,7 @@ from clamber.planning.route import (
     room_on,
 )
 from clamber.planning.stairs import CLEAR, FLUSH, Flight
-from clamber.step.change import Change, home_at
+from clamber.step.change import home_at
 from clamber.step.posture import Keyframe
 
 TURN = 0.25  # [rad] of the body in one cycle on all fours: more, and limbs cross
@@ -70,7 +72,6 @@ STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
 SHARES = (1.0, 0.6, 0.3)  # of its length: a step that fails is tried shorter
 RISER_SHARES = (1.0, 0.5, 0.25)  # ... a cycle over a riser
 NEARER = (0.0, 0.4)  # share of the way to a limb that is stuck, to stand around it
-SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 NEARLY = 0.12  # [m] where it gets no nearer to an edge, it may climb down from here
 STAND_TOLERANCE = 0.12  # lengths of a leg, from where the body stands before an edge
 BESIDE_TOLERANCE = 0.10  # [m] along the edge
@@ -635,9 +636,7 @@ def _is_same(here: Contact, there: Contact) -> bool:
     return bool(np.linalg.norm(there.position - here.position) < SAME)
 
 
-def reversed_steps(
-    changes: Sequence[tuple[Change, str]], home: np.ndarray
-) -> list[tuple[Step, str]]:
+def reversed_steps(changes: Made, home: np.ndarray) -> list[tuple[Step, str]]:
     """The steps of an ascent backwards, from its end to its start.
 
     Args:

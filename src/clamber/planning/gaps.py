@@ -14,9 +14,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.planning.proportions import Proportions
-from clamber.planning.route import Frame, Platform
-
-GRID = 0.02  # [m] that the body goes on by, and that a contact is moved by at least
+from clamber.planning.route import SAME, Frame, Platform
 
 
 def gaps_ahead(
@@ -77,17 +75,17 @@ def due_near_gap(
     hops: dict[str, float] = {}
     last = math.inf
     while x < min(length, last):
-        x += GRID
+        x += SAME
         for n in on:
             to = stretched(n, x)
-            if float((to.position[:2] - frame.xy) @ way) - at[n] <= GRID:
+            if float((to.position[:2] - frame.xy) @ way) - at[n] <= SAME:
                 continue
             if to.support != on[n].support:
                 hops.setdefault(n, x)
             elif n not in hops:
                 walks.setdefault(n, x)
             # Where the first is due, it is that far ahead already.
-            last = min(last, x + step - 2.0 * GRID)
+            last = min(last, x + step - 2.0 * SAME)
     if hops:  # those of the first that is due, both arms or both legs
         x, first = min((d, n) for n, d in hops.items())
         arms = first.endswith("arm")

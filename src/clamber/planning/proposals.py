@@ -17,6 +17,7 @@ from clamber.step.change import Change, Failure
 from clamber.step.posture import Keyframe
 
 Accept = Literal["all", "some", "never"]
+Made = tuple[tuple[Change, str], ...]  # changes with their options
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,13 +47,13 @@ class Outcome:
 
     Attributes:
         key: The keyframe after it.
-        changes: Made, with their options; those that the proposal came after first.
+        changes: Made; those that the proposal came after first.
         left: Surfaces of goals that could not be made.
         failure: Why the last of them; None: there is none.
     """
 
     key: Keyframe
-    changes: tuple[tuple[Change, str], ...] = ()
+    changes: Made = ()
     left: tuple[str, ...] = ()
     failure: Failure | None = None
 
@@ -107,14 +108,19 @@ Manoeuvre = Generator[Proposal | Climb, Outcome, bool]
 Part = Generator[Proposal | Climb, Outcome, None]
 
 
+def stuck(why: str) -> Failure:
+    """There is nothing to go on with."""
+    return Failure(status=Status.STUCK, detail=why)
+
+
 def pursue(
     manoeuvre: Manoeuvre, attempt: Callable[[Proposal | Climb], Outcome]
-) -> tuple[tuple[tuple[Change, str], ...], Failure | None]:
-    """The changes of the first proposal that is accepted, with their options.
+) -> tuple[Made, Failure | None]:
+    """The changes of the first proposal that is accepted.
 
     Without changes, why there are none; neither where the goal has been reached.
     """
-    failure = Failure(status=Status.STUCK, detail="no contact of the cycle moves")
+    failure = stuck("no contact of the cycle moves")
     ask = partial(next, manoeuvre)
     while True:
         try:

@@ -23,6 +23,7 @@ JOINT = 0.02  # [m] a narrower gap is none
 # [m] An edge is climbed so far from its ends, where it is that long: nearer to them, a
 # hand or a knee finds no place on its side.
 BESIDE = 0.25
+SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
 FACING = 0.15  # [rad] from how it shall face
 BORDER = 0.02  # [m] contacts stay so far inside a top's border: less, and they slip off

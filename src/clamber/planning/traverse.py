@@ -15,7 +15,6 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.contact.policy import GeneralPolicy, pelvis_rotation
 from clamber.contact.steps import Step
-from clamber.errors import Status
 from clamber.model.robot import Robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import quat_from_matrix
@@ -25,10 +24,12 @@ from clamber.planning.planner import check_start, search_steps, timed
 from clamber.planning.proposals import (
     Climb,
     Goal,
+    Made,
     Outcome,
     Proposal,
     Round,
     pursue,
+    stuck,
 )
 from clamber.planning.records import (
     Fallback,
@@ -150,9 +151,7 @@ class Follower:
         self.gait, self.options = gait, options
         self._ik, self._quadrupedal = ik, quadrupedal_posture(ik, gait)
 
-    def next_changes(
-        self, key: Keyframe
-    ) -> tuple[tuple[tuple[Change, str], ...], Failure | None]:
+    def next_changes(self, key: Keyframe) -> tuple[Made, Failure | None]:
         """What is done next, and why nothing; neither where it has arrived."""
 
         def attempt(proposal: Proposal | Climb) -> Outcome:
@@ -169,8 +168,7 @@ class Follower:
         route, _ = search_steps(self._ik, start, steps, self.options)
         failure = next(iter(route.failures), None)
         if not steps:
-            detail = "nothing is left to climb with"
-            failure = Failure(status=Status.STUCK, detail=detail)
+            failure = stuck("nothing is left to climb with")
         if failure is not None:
             return Outcome(key=route.end, failure=failure)
         options = (option for _, option in climb.steps)
@@ -252,11 +250,11 @@ def follow(
         since = [*(() if nearer else since), key.stance]
         if len(since) > PATIENCE + 1:
             why = f"{PATIENCE} cycles bring it no nearer to the goal, {to_go:.2f} m"
-            failure = Failure(status=Status.STUCK, detail=why)
+            failure = stuck(why)
             break
         if any(_is_same(since[-1], stance) for stance in since[:-1]):
             why = f"it only goes to and fro, {to_go:.2f} m from the goal"
-            failure = Failure(status=Status.STUCK, detail=why)
+            failure = stuck(why)
             break
         note = f"{to_go:.2f} m to go, {len(changes)} contact changes"
         report("plan", 1.0 - min(to_go / max(first, 1e-9), 1.0), note)
@@ -277,8 +275,7 @@ def follow(
             label = f"{option}, {name}" if name else option
             iterations.append(Iteration(option=label, cost=cost))
     if not arrived and failure is None and len(changes) >= limit:
-        why = f"{limit} contact changes were not enough"
-        failure = Failure(status=Status.STUCK, detail=why)
+        failure = stuck(f"{limit} contact changes were not enough")
     route = Route(
         start=start,
         changes=tuple(changes),
