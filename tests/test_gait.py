@@ -231,6 +231,10 @@ def test_feet_step_to_where_the_body_stands_before_the_edge():
         assert step >= lengths[0] > 0.0
         np.testing.assert_allclose(lengths, np.array(SHARES) * lengths[0])
     assert walk.body.xy[0] <= 0.45 - gait.build.stand + 1e-9
+    # One foot is enough, where the other cannot.
+    able = Obstinate(gait, on_feet(0.0, 0.05), lambda c: c.surface == "LFoot")
+    ((change, option),), _ = able.pursue()
+    assert (change.step.makes.surface, option) == ("RFoot", "ac4")
 
 
 def test_before_the_edge_hands_elbows_and_knees_climb_in_the_policys_order(gait):
@@ -266,6 +270,11 @@ def test_a_descent_is_the_ascent_reversed_and_stands_up_at_its_end(gait):
     feet = on_feet(0.83 + 0.3, yaw=math.pi)
     _, down = proposed(gait, (*feet, *back[:2]), refused=lambda c: False)
     assert wanted(down) == (*HANDS[::-1], "-", "-")
+    # And where that cannot be done, nothing moves on top.
+    able = Obstinate(gait, (*feet, *back[:2]), lambda c: len(able.asked) > 1)
+    able.pursue()
+    assert len(able.asked) == 2
+    assert not cycles(able.asked)
 
 
 def test_where_there_is_no_way_down_contacts_move_to_where_there_is(gait):
@@ -301,6 +310,14 @@ def test_where_not_all_of_a_pair_fit_on_a_tread_both_go_to_their_next_places():
     able = Obstinate(gait, (*feet, *stance), lambda c: c.surface == "LFoot")
     changes, _ = able.pursue()
     assert [change.step.makes.surface for change, _ in changes] == ["RFoot"]
+
+
+def test_where_it_gets_no_nearer_to_the_edge_it_may_climb_down_from_there(gait):
+    for away, down in ((0.08, True), (0.16, False)):
+        back = on_fours(gait, 0.83 - gait.build.behind - away, math.pi)
+        *crawl, last = proposed(gait, back)
+        assert cycles(crawl)
+        assert isinstance(last, Climb) == down
 
 
 # On all fours.
@@ -410,25 +427,38 @@ def test_knees_leave_their_thighs_room_before_a_riser():
     assert riser < above.position[0] < riser + 0.05
 
 
-def test_over_a_riser_shorter_cycles_and_hands_are_proposed_first():
-    heights = (("a", 0.23, 0.1), ("b", 0.73, 0.2), ("c", 1.23, 0.1))
-    boxes = tuple(box(n, x, 0.5, height=h) for n, x, h in heights)
-    gait = gait_in(Scene(boxes=boxes, start=np.zeros(3), goal=np.array([2.1, 0.0])))
-    assert gait.has_risers(gait.platforms[0])
-    stance = tuple(
-        replace(c, position=np.array([*c.position[:2], 0.1]))
-        for c in on_fours(gait, 0.5, support="a")
-    )
-    tries = cycles(proposed(gait, stance))
-    shares = [gait.quadrupedal_frame(stance).away(p.body) for p in tries[:12]]
-    expected = np.repeat([*RISER_SHARES, *RISER_SHARES], 2) * shares[0]
-    np.testing.assert_allclose(shares, expected)
-    arms = [{s[1:] for s in wanted(p) if s[1:] != "Knee"} for p in tries[:12]]
+@pytest.fixture(scope="module")
+def risers() -> Gait:
+    """Up at x = 0.73, down again at 1.23."""
+    rows = (("a", 0.23, 0.1), ("b", 0.73, 0.2), ("c", 1.23, 0.1))
+    boxes = tuple(box(n, x, 0.5, height=h) for n, x, h in rows)
+    return gait_in(Scene(boxes=boxes, start=np.zeros(3), goal=np.array([2.1, 0.0])))
+
+
+def test_over_a_riser_shorter_cycles_and_hands_are_proposed_first(risers):
+    stance = on_fours(risers, 0.5, support="a")
+    tries = cycles(proposed(risers, stance))[:12]
+    ways = [risers.quadrupedal_frame(stance).away(p.body) for p in tries]
+    np.testing.assert_allclose(ways, np.repeat(2 * RISER_SHARES, 2) * ways[0])
+    arms = [{s[1:] for s in wanted(p) if s[1:] != "Knee"} for p in tries]
     assert arms == [{"Elbow"}] * 6 + [{"Hand"}] * 6
-    legs_first = [wanted(p)[0].endswith("Knee") for p in tries[:12]]
-    assert legs_first == [False, True] * 6
+    assert [wanted(p)[0][1:] == "Knee" for p in tries] == [False, True] * 6
     level = gait_in(row(0.01, 0.5, 0.5))
     assert not level.has_risers(level.platforms[0])
+
+
+def test_what_has_climbed_a_riser_does_not_go_back_down_for_another_ones_sake(risers):
+    """Where knees are at 0.45 m, elbows belong before the riser."""
+    stance = tuple(contact(s, 0.80, y, "b") for s, y in zip(ELBOWS, (0.12, -0.12)))  # noqa: B905
+    stance += tuple(contact(s, 0.45, y, "a") for s, y in zip(KNEES, (0.1, -0.1)))  # noqa: B905
+    tries = cycles(proposed(risers, stance, lambda c: c.surface == "RKnee"))
+    back = [p for p in tries if p.accept == "never"]
+    assert back
+    for p in back:
+        (goal,) = p.goals  # one by one: the stuck one may follow before all are back
+        to = goal.contacts[0]
+        here = next((c for c in p.after.stance if c.surface == to.surface), to)
+        assert here.support <= to.support
 
 
 # Gaps.
