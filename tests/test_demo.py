@@ -22,7 +22,7 @@ from clamber.recording.demonstration import (
     build_demonstration,
     runs,
 )
-from clamber.recording.recording import load_demo
+from clamber.recording.recording import load_demo, read_points
 from clamber.recording.skeleton import recognise
 from support.files import box_obj
 
@@ -300,6 +300,13 @@ def test_a_demonstration_keeps_its_arrays(write):
             source="x", t=demo.t[::-1], names=demo.names, position=demo.position,
             valid=demo.valid, scene=demo.scene, subject={},
         )  # fmt: skip
+
+
+def test_a_demonstration_says_itself_shortly(write):
+    demo = load_demo(write())
+    assert len(repr(demo)) < 300
+    points = read_points(write().with_name("joints.npy"), names=NAMES, rate=30.0)
+    assert "position=array(60, 15, 3)" in repr(points)
 
 
 def test_a_point_never_seen_is_dropped_unless_it_is_needed():

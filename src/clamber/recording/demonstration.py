@@ -17,6 +17,7 @@ import numpy as np
 
 from clamber.contact.contact import PARTS
 from clamber.errors import InputError
+from clamber.model.records import short_repr
 from clamber.model.scene import Box, Scene, Support
 
 SIDES = ("L", "R")
@@ -68,6 +69,8 @@ class Demonstration:
     gaps: tuple[Gap, ...] = ()
     offsets: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Copy the arrays, check shapes, that `t` increases and nothing is NaN."""
@@ -131,6 +134,8 @@ class RawTracks:
     offsets: Mapping[str, float] = field(default_factory=dict)
     raised: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
 
 def build_demonstration(tracks: RawTracks) -> Demonstration:

@@ -29,6 +29,7 @@ from clamber.contact.contact import (
     Stance,
 )
 from clamber.errors import InputError
+from clamber.model.records import short_repr
 from clamber.model.scene import Scene, Support
 from clamber.model.se3 import frame_from_normal, quat_from_matrix
 from clamber.recording.demonstration import (
@@ -123,6 +124,8 @@ class _Tracks:
     options: DetectOptions
     position: np.ndarray  # (T, F, 3) [m]
     speeds: np.ndarray  # (T, F) [m/s]
+
+    __repr__ = short_repr
 
     def at(self, name: str) -> np.ndarray:
         """(T, 3) smoothed track of a point."""

@@ -20,6 +20,7 @@ from typing import BinaryIO
 import numpy as np
 
 from clamber.errors import InputError, unreadable
+from clamber.model.records import short_repr
 
 MAX_RATE = 100_000.0  # [Hz] more is a mistake, not a camera
 MAX_POINTS = 10_000
@@ -58,6 +59,8 @@ class Points:
     up: str | None = None
     usual_up: str = "z"
     orientation: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
 
 def read_safely(read: Callable[[Path], Points], path: Path) -> Points:

@@ -18,6 +18,7 @@ import numpy as np
 
 from clamber.contact.contact import PARTS
 from clamber.errors import InputError
+from clamber.model.records import short_repr
 from clamber.recording.demonstration import REQUIRED, SIDES
 
 # Skeletons.
@@ -140,6 +141,8 @@ class Recognised:
     columns: Mapping[str, tuple[int, ...]]
     on_skin: bool = False
     raised: Mapping[str, float] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     def used(self) -> list[int]:
         """Columns that matter, each once."""
