@@ -68,7 +68,7 @@ def answered(plan: Plan, q, reference, contacts, ticks: int = 1) -> np.ndarray:
     """(na,) offset of the joints after some looks at the same posture."""
     balance = Balance(plan.world, PERIOD)
     for _ in range(ticks):
-        balance.feel(q, reference, contacts)
+        balance.update(q, reference, contacts)
     for _ in range(50):
         offset = balance.offset(SMOOTHING / 5)
     return offset
@@ -197,10 +197,10 @@ def test_back_within_its_margin_the_offset_fades(demo_plan, kin, kneeling):
     q, sagged, three, _ = endangered(demo_plan, kin, kneeling)
     balance = Balance(demo_plan.world, PERIOD)
     for _ in range(200):
-        balance.feel(sagged, q, three)
+        balance.update(sagged, q, three)
     sizes = []
     for _ in range(1000):
-        balance.feel(q, q, kneeling[1])
+        balance.update(q, q, kneeling[1])
         for _ in range(10):
             offset = balance.offset(1e-3)
         sizes.append(float(np.abs(offset).max()))
@@ -211,7 +211,7 @@ def test_back_within_its_margin_the_offset_fades(demo_plan, kin, kneeling):
 def test_in_the_air_nothing_is_asked_for(demo_plan, kneeling):
     q, _ = kneeling
     balance = Balance(demo_plan.world, PERIOD)
-    balance.feel(q, q, ())
+    balance.update(q, q, ())
     assert not balance.offset(PERIOD).any()
 
 

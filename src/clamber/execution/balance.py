@@ -48,7 +48,7 @@ class Balance:
         self._goal = np.zeros(len(world.dadr))
         self._offset = np.zeros(len(world.dadr))
 
-    def feel(
+    def update(
         self, q: np.ndarray, reference: np.ndarray, contacts: Sequence[Contact]
     ) -> None:
         """Look at where the centre of mass is; once every period.
@@ -56,7 +56,7 @@ class Balance:
         Args:
             q: (nq,) as measured.
             reference: (nq,) as planned.
-            contacts: That the plan has closed; one without load gets it from leaning.
+            contacts: That the plan has closed, loaded or not.
         """
         kin, dt = self._kin, self._period
         if not contacts:

@@ -1,23 +1,25 @@
-"""Plan, measurements -> servo commands: execution that feels its contacts.
+"""Plan, measurements -> servo commands: execution that reacts to its contacts.
 
 The trajectory is a reference, not a promise. A limb that touches early stops there and
-the contact is taken where it is; one that has not touched at the planned point goes on
-along the normal until it does, or until `REACH` is used up. Where a contact is not
-where it was planned, the supports are estimated anew from all contacts felt so far, the
-stance is taken as it is, and the remaining keyframes are solved again from there while
-the robot stands still. A contact that bears nothing at the end of a step is felt for
-again. Where nothing is found, the others bear the robot and another place is planned
-for the limb; where there is none, the robot stays in the stance it is in and says why.
+the contact is taken where it is; one that has not touched at the planned point is
+probed for along the normal until it does, or until `REACH` is used up. Where a contact
+is not where it was planned, the supports are estimated anew from all contacts measured
+so far, the stance is taken as it is, and the remaining contact changes are planned
+again from there while the robot stands still. A contact that carries nothing at the end
+of a change is probed for again. Where nothing is found, the others carry the robot and
+another place is planned for the limb; where there is none, the robot stays in the
+stance it is in and says why.
 
-What is sensed is `Measurement`: joint encoders, base pose, contact force of each
-surface; late and noisy. Nothing else of the physics is looked at.
+Beside the plan there are four reactions, the most urgent first: to an unintended
+contact (`_retreat`), to one that is elsewhere (`_take`, `_accept`), to one that is
+missing (`_seek`) and to one that is lost (`_recover`). What is known is an `Estimate`,
+what the joints are to do a `Reference`; between them this module decides.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +28,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.contact.steps import split_moves
 from clamber.execution.balance import Balance
+from clamber.execution.estimate import LOST, TOUCH, Estimate
 from clamber.execution.events import (
     ContactMoved,
     Event,
@@ -38,82 +41,60 @@ from clamber.execution.events import (
     Stopped,
     Unintended,
 )
-from clamber.execution.leaning import (
-    Lean,
-    is_leaning,
-    leaning_part,
-    strikes,
-    striking_part,
-)
+from clamber.execution.reference import Reference, Ticks
 from clamber.execution.sensors import Measurement
-from clamber.execution.servo import JointLaw
-from clamber.execution.terrain import believed_scene
-from clamber.model.kinematics import Kinematics
-from clamber.model.scene import GROUND, Scene
+from clamber.execution.servo import JointServo, SelfPositioning
+from clamber.execution.unintended import (
+    UnintendedContact,
+    hit_sideways,
+    load_is_missing,
+    loaded_link,
+    nearest_of,
+)
 from clamber.model.se3 import wrap, yaw_of
-from clamber.model.world import PHYSICS_STEP, World, chain_up, limb_links
+from clamber.model.world import PHYSICS_STEP, World, limb_links
 from clamber.planning.adaptation import (
     REACH,
     adapt_plan,
     feeling,
-    felt_contact,
     go_on,
     start_again,
 )
 from clamber.planning.records import Plan, State
 from clamber.planning.trajectory import HOLD_END, HOLD_START, Trajectory
-from clamber.step.posture import Keyframe
 
-TOUCH = 10.0  # [N] normal force that is a contact
-LOST = 1.5  # [N] a contact of the stance that bears less is lost
-FORCE_SMOOTHING = 0.03  # [s] time constant of the forces
-POSE_SMOOTHING = 0.01  # [s] ... and of the measured posture: it must not lag a touch
-TILTED = 0.35  # [rad] a sole that is more so touches with a corner
-NEAR = 0.06  # [m] sideways from the planned place, a touch is that contact
 DEVIATION = 0.006  # [m] along the normal: the rest is planned again
 DRIFT = 0.015  # [m] along the support: the rest is planned again
 START_DRIFT = 0.010  # [m] of the start, as far as the arms reach
+ARM = 0.3  # [m] of it, by which a turn of the start counts
 MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 1.0  # [s] the robot stands still while the rest is planned again
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
-EASING = 0.5  # [s] from held to self-positioned
-BLEND = 0.3  # [s] back to a trajectory that was left
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
-SAME_PLACE = 0.05  # [m] a surface that is felt again this near replaces what was felt
-LEANING = 0.1  # [s] a part bears for so long where it should not: it leans
-SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for what leans
+UNINTENDED = 0.1  # [s] a link is loaded for so long where it should not be: it is
+SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for such a load
 LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
-KEPT_OFF = 0.02  # [m] farther than where it leant
-WITHDRAWALS = 4  # as often another way is looked for
+CLEARANCE = 0.02  # [m] farther than where an unintended contact was
+RETREATS = 4  # as often another way is looked for
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
+FIRST = round(HOLD_START / PHYSICS_STEP) - 1  # sample from which a trajectory moves
 
-Ticks = Iterator[None]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Leg:
-    """One step of a trajectory, from a keyframe to the next, in samples."""
-
-    begin: int  # sample of the keyframe before
-    swing: int  # first sample with the limb in the air
-    touch: int  # last sample before the new contact is closed
-    end: int
-    made: Contact | None
+# Of a reaction: whether there was something to react to.
+Reaction = Generator[None, None, bool]
 
 
-class Tracking:
-    """The trajectory as it is, sample by sample: open loop."""
+class OpenLoop:
+    """The trajectory as it is, sample by sample."""
 
     def __init__(self, plan: Plan, world: World) -> None:
         """Follow `plan` on the servos of `world`."""
         assert plan.trajectory is not None
         self._trajectory = plan.trajectory
-        self._law = JointLaw(world)
+        self._servo = JointServo(world)
         self._qadr, self._dadr = world.qadr, world.dadr
         self._k = -1
         self.events: list[Event] = []
-        self.stopped = ""
         self.followed: Trajectory | None = None
         final = plan.keyframes[-1].stance
         self.rests_on = tuple(f"{c.surface}@{c.support}" for c in final)
@@ -123,7 +104,7 @@ class Tracking:
         self._k = k = self._k + 1
         t = self._trajectory
         q, v = t.q[k, self._qadr], t.v[k, self._dadr]
-        return self._law.command(q, v, t.tau[k], measured.q[self._qadr])
+        return self._servo.command(q, v, t.tau[k], measured.q[self._qadr])
 
     @property
     def reference(self) -> np.ndarray:
@@ -136,58 +117,80 @@ class Tracking:
         return len(self._trajectory.time) - 1 - self._k
 
 
-class Execution:
-    """Follows a plan by feel; see the module's docstring.
+@dataclass(frozen=True, eq=False, slots=True)
+class _Span:
+    """A contact change of a trajectory, in samples."""
+
+    begin: int  # sample of the keyframe before
+    swing: int  # first sample with the limb in the air
+    touch: int  # last sample before the new contact is closed
+    end: int
+    makes: Contact | None
+
+
+def _spans(plan: Plan, t: Trajectory) -> list[_Span]:
+    """The contact changes of a trajectory."""
+    out = []
+    for j, (before, after) in enumerate(itertools.pairwise(plan.keyframes)):
+        parts = [x for x in t.segments if x.change == j]
+        begin, end = t.at(float(t.keyframes[j])), parts[-1].end - 1
+        making = next((x for x in parts if x.makes is not None), None)
+        if making is None:
+            out.append(_Span(begin, begin, end, end, None))
+            continue
+        # A limb that is in the air swings from the start.
+        gone = {c.surface for c in before.stance} - {c.surface for c in after.stance}
+        swing = making.begin if gone else begin
+        out.append(_Span(begin, swing, making.end - 1, end, making.makes))
+    return out
+
+
+class Executive:
+    """Follows a plan and reacts to what it measures; see the module's docstring.
 
     What it does is written as one sequence of actions (`_behave`), each of which takes
     some physics steps: a generator that sets the reference and yields once for each.
+
+    Attributes:
+        estimate: What is known.
+        events: What was measured, and done about it.
+        done: Steps of the plan's sequence that have been done.
+        left: Physics steps to the end, as far as is known.
+        stopped: Why it stopped; empty where it did not.
+        rests_on: At the end, contacts by `surface@support`.
     """
 
     def __init__(self, plan: Plan, world: World) -> None:
         """Follow `plan` on the servos of `world`, which is not looked at otherwise."""
         assert plan.trajectory is not None
         self._plan = plan
-        self._law = JointLaw(world)
-        self._qadr, self._dadr, self._nv = world.qadr, world.dadr, world.model.nv
-        self._surfaces = tuple(world.surfaces)
-        # Rows of the surfaces of each arm.
-        self._arms = [
-            [self._surfaces.index(s) for s in limb.surfaces]
-            for limb in world.robot.limbs.values()
-            if limb.is_arm
-        ]
-        self._ankles = _ankles(world)
-        self._positioned = np.zeros(len(self._qadr))  # share of (4.32), by joint
-        self._made = 0 if plan.state is None else plan.state.done
-        # A policy reads what comes next off the stance.
-        by_policy = plan.policy is not None
-        self._steps = () if by_policy else split_moves(plan.sequence, plan.world)[0]
-        self._felt: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
-        self._weight = 0.0  # [N] as felt
+        self._servo, self._ankles = JointServo(world), SelfPositioning(world)
+        self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
+        self._qadr = world.qadr
         speed = plan.options.speed
         self._slow = speed != "max" and speed <= SLOW
-        self._leaning = 0.0  # [s] so long
-        self._wary: dict[tuple[int, str], float] = {}  # see `IK`
-        self._lean: Lean | None = None
-        # What leans without there being another way.
-        self._stays: set[tuple[int, str]] = set()
-        self._withdrawals = 0
-        self._searches = 0
-        self._scale = 1.0  # of the torques: mass as felt over mass as described
-        self._pose = plan.trajectory.q[0].copy()
-        self._load = np.zeros((len(self._surfaces), 3))
+        self._weight = 0.0  # [N] as measured
+        self._scale = 1.0  # of the torques: mass as measured over mass as described
+        self._unintended_for = 0.0  # [s]
+        self._unintended: UnintendedContact | None = None
+        self._clearance: dict[tuple[int, str], float] = {}  # extra, see `IK`
+        # Unintended contacts that there is no way around.
+        self._accepted: set[tuple[int, str]] = set()
+        self._retreats = self._searches = 0
         self._k = 0  # physics steps so far
-        self._velocity = np.zeros(len(self._dadr))
-        self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        self._left_plan = False
+        self.done = 0 if plan.state is None else plan.state.done
+        # A policy reads what comes next off the stance: it has no steps to count.
+        by_policy = plan.policy is not None
+        steps = [] if by_policy else split_moves(plan.sequence, plan.world)[0]
+        self._steps = len(steps)
+        self._reached = [float(plan.trajectory.keyframes[0])]  # [s] each keyframe
         self.left = len(plan.trajectory.time)
         self.events: list[Event] = []
         self.stopped = ""
         self.rests_on: tuple[str, ...] = ()
-        # As far as it goes it is followed, whatever it misses.
-        self._adopt(replace(plan, complete=True, failures=()), plan.trajectory)
-        self._set(plan.trajectory, 0)
-        self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
+        self.estimate = Estimate(plan.world, plan.trajectory.q[0])
+        self._ref = Reference(plan.trajectory, plan.world)
+        self._adopt(plan, plan.trajectory, 0)
         self._behaviour = self._behave()
 
     def command(self, measured: Measurement) -> np.ndarray:
@@ -195,138 +198,196 @@ class Execution:
         self._sense(measured)
         next(self._behaviour)
         self._k += 1
-        v = np.zeros(self._nv)
-        v[self._dadr] = self._velocity
-        reference = self._balanced()
-        self._rows.append((reference, v, self._torque, self._closed))
-        return self._law.command(
-            reference[self._qadr],
-            self._velocity,
-            self._scale * self._torque,
+        ref, q = self._ref, self._balanced()
+        ref.record(q)
+        return self._servo.command(
+            q[self._qadr],
+            ref.velocity,
+            self._scale * ref.torque,
             measured.q[self._qadr],
-            self._self_positioning(),
+            self._ankles.share(
+                (self.estimate.load[:, 2] > TOUCH).tolist(),
+                ref.closed,
+                ref.closed_ahead(AHEAD),
+            ),
         )
+
+    @property
+    def reference(self) -> np.ndarray:
+        """(nq,) of the last command, but for what the balance adds."""
+        return self._ref.q
 
     @property
     def followed(self) -> Trajectory | None:
         """What was followed, where that is not the plan; velocities of joints only."""
-        if not self._left_plan:
-            return None
-        q, v, tau, contact = (np.array(x) for x in zip(*self._rows, strict=True))
-        first = self._plan.trajectory
-        assert first is not None
-        return replace(
-            first,
-            time=np.arange(len(q)) * PHYSICS_STEP,
-            q=q,
-            v=v,
-            tau=tau,
-            contact=contact,
-            keyframes=first.keyframes[:1],
-        )
+        return self._ref.followed(np.array(self._reached))
+
+    @property
+    def stance(self) -> tuple[Contact, ...]:
+        """Of the last keyframe that was reached, as planned."""
+        return self._keyframes[self._change].stance
+
+    @property
+    def clearance(self) -> dict[tuple[int, str], float]:
+        """Extra clearance [m] by geom and support, after unintended contacts."""
+        return dict(self._clearance)
 
     # What it does.
 
     def _behave(self) -> Ticks:
-        yield from self._play(round(HOLD_START / PHYSICS_STEP) - 1)
+        yield from self._ref.play(FIRST)
         yield from self._check_start()
         while not self.stopped:
-            if self._leg < len(self._legs):
-                yield from self._step()
-            elif self._more:
+            if self._change < len(self._spans):
+                yield from self._make_change(self._spans[self._change])
+            elif self._goes_on:
                 yield from self._go_ahead()
-            elif self._leans():
-                yield from self._withdraw(self._i)
-            else:
+            elif not (yield from self._retreat_from_here()):
                 break
-        if self._missed and not self.stopped:
-            self._stop(self._missed)
+        if self._failure and not self.stopped:
+            self._stop(self._failure)
         yield from self._end()
 
-    def _step(self) -> Ticks:
-        """One leg of the trajectory: shift, swing, touch, settle."""
-        leg = self._legs[self._leg]
-        c = leg.made
-        if c is not None:
-            near = 0.5 * (leg.swing + leg.touch)
-            # The way to where the leg begins may be what ends a lean.
-            yield from self._play(
-                leg.touch,
-                until=lambda: (
-                    (self._i > near and self._touches(c))
-                    or (self._i > leg.begin and self._leans())
-                ),
-            )
-            if self._lean is not None:
-                yield from self._withdraw(leg.begin)
-                return
-            if self._i < leg.touch and self._off(c)[0] > DEVIATION:
-                yield from self._take(c)
-                return
-            yield from self._play(leg.touch)
-            if not self._touches(c):
-                felt = yield from self._feel(c)
-                if felt is None:
-                    yield from self._seek(c)
-                    return
-                if felt is not c or abs(self._off(c)[0]) > DEVIATION:
-                    yield from self._take(felt)
-                    return
-                self._resume()
-        yield from self._play(leg.end, until=self._leans)
-        self._leg += 1
-        self._tick_off(leg)
-        if self._lean is not None:
-            yield from self._withdraw(leg.touch, leg.made)
+    def _make_change(self, span: _Span) -> Ticks:
+        """One contact change: shift, swing, touch, settle."""
+        if span.makes is not None and (yield from self._make(span, span.makes)):
             return
-        stance = self._keyframes[self._leg].stance
-        self._remember([c for c in stance if self._force(c) >= LOST])
+        yield from self._ref.play(span.end, until=self._is_unintended)
+        self._count_change()
+        if self._unintended is not None:
+            yield from self._retreat(span.touch, span.makes)
+            return
+        loaded = [c for c in self.stance if self.estimate.force(c) >= LOST]
+        self.estimate.remember(loaded, self.done)
         yield from self._check_stance()
 
-    def _withdraw(self, to: int, made: Contact | None = None) -> Ticks:
-        """A part bears where it should not: back, and on with more distance of it.
-
-        `made` is a contact that bears nothing as yet back there.
-        """
-        m, lean = self._world.model, self._lean
-        assert lean is not None
-        self._lean = None
-        link = m.body(m.geom_bodyid[lean.geom]).name
-        self._note(Unintended, link=link, support=lean.support)
-        key = lean.geom, lean.support
-        self._wary[key] = KEPT_OFF + max(lean.distance, self._wary.get(key, 0.0))
-        self._withdrawals += 1
-        yield from self._back(to)
-        stance = self._keyframes[self._leg].stance
-        actual = {c: self._other(c) or c for c in stance}
-        loaded = [x for c, x in actual.items() if c is not made]
-        at_hand = self._trajectory
-        yield from self._replan(tuple(actual.values()), loaded)
-        if self._trajectory is at_hand:
-            self._stays.add(key)
+    def _make(self, span: _Span, c: Contact) -> Reaction:
+        """Close a contact; false where that went as planned."""
+        ref, touches = self._ref, self.estimate.touches
+        near = 0.5 * (span.swing + span.touch)
+        # The way to where the change begins may be what ends an unintended contact.
+        yield from ref.play(
+            span.touch,
+            until=lambda: (
+                (ref.i > near and touches(c))
+                or (ref.i > span.begin and self._is_unintended())
+            ),
+        )
+        if self._unintended is not None:
+            yield from self._retreat(span.begin)
+            return True
+        if ref.i < span.touch and self.estimate.deviation(c)[0] > DEVIATION:
+            yield from self._take(c, c)
+            return True
+        yield from ref.play(span.touch)
+        if touches(c):
+            return False
+        found = yield from self._probe(c)
+        if found is None:
+            yield from self._seek(c)
+        elif found is not c or abs(self.estimate.deviation(c)[0]) > DEVIATION:
+            yield from self._take(found, c)
+        else:
+            ref.resume()
+            return False
+        return True
 
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
         key = self._keyframes[-1]
-        found = go_on(self._plan, self._world, key, self._wary)
+        found = go_on(self._plan, self.estimate.world, key, self._clearance)
         if found.trajectory is None:
-            self._more = False
+            self._goes_on = False
             if found.failures:
                 self._stop(str(found.failures[0]))
             return
-        self._adopt(found, found.trajectory)
-        yield from self._play(round(HOLD_START / PHYSICS_STEP) - 1)
+        self._adopt(found, found.trajectory, 0)
+        yield from self._ref.play(FIRST)
 
-    def _take(self, made: Contact) -> Ticks:
+    def _check_start(self) -> Ticks:
+        """Is the robot where it should be, and as heavy?"""
+        world = self.estimate.world
+        weight = self._weight = float(self.estimate.load[:, 2].sum())
+        ratio = weight / (9.81 * world.mass)
+        if abs(ratio - 1.0) > MASS_CHANGE:
+            self._note(Heavier, factor=ratio)
+            self._scale = float(np.clip(ratio, 0.5, 2.0))
+        if self._plan.state is not None:
+            yield from self._check_stance()
+            return
+        q, ref = self.estimate.q, self.reference
+        yaw = float(wrap(yaw_of(q[3:7]) - yaw_of(ref[3:7])))
+        x, y, theta = world.scene.start
+        c, s = np.cos(yaw), np.sin(yaw)
+        rel = np.array([x, y]) - ref[:2]
+        xy = q[:2] + np.array([c * rel[0] - s * rel[1], s * rel[0] + c * rel[1]])
+        away = float(np.linalg.norm(xy - [x, y]))
+        off = away + ARM * abs(yaw)
+        if off <= START_DRIFT:
+            return
+        self._note(StartsElsewhere, distance=away, yaw=yaw)
+        scene = replace(world.scene, start=np.array([*xy, theta + yaw]))
+        found = start_again(self._plan, scene)
+        yield from self._ref.rest(THINKING)
+        yield from self._follow(found, off)
+
+    def _check_stance(self) -> Ticks:
+        """At a keyframe: the reactions that are due, the most urgent first."""
+        if self._change == len(self._spans) and not self._goes_on:
+            return  # the last one: nothing depends on it
+        # What is unintended takes the load of contacts, which are not lost.
+        for react in (self._retreat_from_here, self._recover, self._accept):
+            if (yield from react()):
+                return
+
+    def _end(self) -> Ticks:
+        """Hold the last posture."""
+        n = round(HOLD_END / PHYSICS_STEP)
+        self._ref.stand()
+        for k in range(n):
+            self.left = n - 1 - k
+            if self.left == 0:
+                self.rests_on = tuple(self._resting())
+            yield
+
+    # How it reacts.
+
+    def _retreat_from_here(self) -> Reaction:
+        """Is there an unintended contact? Then another way from this very stance."""
+        if not self._is_unintended():
+            return False
+        yield from self._retreat(self._ref.i)
+        return True
+
+    def _retreat(self, to: int, makes: Contact | None = None) -> Ticks:
+        """A link is loaded where it should not be: back, on with more clearance of it.
+
+        `makes` is a contact that carries nothing as yet back there.
+        """
+        at = self._unintended
+        assert at is not None
+        self._unintended = None
+        m, key = self.estimate.world.model, (at.geom, at.support)
+        link = m.body(m.geom_bodyid[at.geom]).name
+        self._note(Unintended, link=link, support=at.support)
+        known = self._clearance.get(key, 0.0)
+        self._clearance[key] = CLEARANCE + max(at.distance, known)
+        self._retreats += 1
+        yield from self._ref.back(to)
+        actual = {c: self.estimate.substitute(c) or c for c in self.stance}
+        loaded = [x for c, x in actual.items() if c is not makes]
+        at_hand = self._ref.trajectory
+        yield from self._replan(tuple(actual.values()), loaded)
+        if self._ref.trajectory is at_hand:
+            self._accepted.add(key)
+
+    def _take(self, made: Contact, planned: Contact) -> Ticks:
         """A contact is made where it was not planned: the rest is planned again."""
-        leg = self._legs[self._leg]
         limb = self._plan.world.robot.limb_of(made.surface)
-        after = self._keyframes[self._leg + 1].stance
+        after = self._keyframes[self._change + 1].stance
         stance = [c for c in after if c.surface not in limb.surfaces]
-        assert leg.made is not None
-        self._note_moved(made, leg.made, made=True)
-        self._leg += 1
-        self._tick_off(leg)
+        self._note_moved(made, planned, made=True)
+        self._count_change()
         yield from self._replan((*stance, made), stance)
 
     def _seek(self, c: Contact) -> Ticks:
@@ -338,204 +399,110 @@ class Execution:
         self._searches += 1
         self.events.append(missing)
         limb = self._plan.world.robot.limb_of(c.surface)
-        stance = self._keyframes[self._leg].stance
-        held = [x for x in stance if x.surface not in limb.surfaces]
+        held = [x for x in self.stance if x.surface not in limb.surfaces]
         yield from self._replan(held, held)
 
-    def _check_start(self) -> Ticks:
-        """Is the robot where it should be, and as heavy?"""
-        weight = self._weight = float(self._load[:, 2].sum())
-        ratio = weight / (9.81 * self._world.mass)
-        if abs(ratio - 1.0) > MASS_CHANGE:
-            self._note(Heavier, factor=ratio)
-            self._scale = float(np.clip(ratio, 0.5, 2.0))
-        if self._plan.state is not None:
-            yield from self._check_stance()
-            return
-        q, ref = self._pose, self.reference
-        yaw = float(wrap(yaw_of(q[3:7]) - yaw_of(ref[3:7])))
-        x, y, theta = self._world.scene.start
-        c, s = np.cos(yaw), np.sin(yaw)
-        rel = np.array([x, y]) - ref[:2]
-        xy = q[:2] + np.array([c * rel[0] - s * rel[1], s * rel[0] + c * rel[1]])
-        away = float(np.linalg.norm(xy - [x, y]))
-        off = away + 0.3 * abs(yaw)
-        if off <= START_DRIFT:
-            return
-        self._note(StartsElsewhere, distance=away, yaw=yaw)
-        scene = replace(self._world.scene, start=np.array([*xy, theta + yaw]))
-        found = start_again(self._plan, scene)
-        yield from self._rest(THINKING)
-        yield from self._follow(found, off)
-
-    def _check_stance(self) -> Ticks:
-        """At a keyframe: is every contact where it should be, and does it bear?"""
-        stance = self._keyframes[self._leg].stance
-        if self._leg == len(self._legs) and not self._more:
-            return  # the last one: nothing depends on it
-        if self._leans():  # and takes the load of contacts, which are not lost
-            yield from self._withdraw(self._i)
-            return
-        for c in stance:
-            if self._force(c) >= LOST or self._other(c) is not None:
+    def _recover(self) -> Reaction:
+        """Does a contact of the stance carry nothing? Then it is probed for again."""
+        for c in self.stance:
+            if not self.estimate.is_lost(c):
                 continue
             self._note(Lost, surface=c.surface)
-            felt = yield from self._feel(c)
-            if felt is None:
+            others = [x for x in self.stance if x is not c]
+            found = yield from self._probe(c)
+            if found is None:
                 self._note(Lost, surface=c.surface, given_up=True)
-                others = [x for x in stance if x is not c]
                 yield from self._replan(others, others)
-                return
-            if felt is not c or abs(self._off(c)[0]) > DEVIATION:
-                others = [x for x in stance if x is not c]
-                yield from self._replan((*others, felt), others)
-                return
-            self._resume()
-        actual = tuple(self._other(c) or c for c in stance)
-        for c, planned in zip(actual, stance, strict=True):
-            up, side = self._off(c)
+                return True
+            if found is not c or abs(self.estimate.deviation(c)[0]) > DEVIATION:
+                yield from self._replan((*others, found), others)
+                return True
+            self._ref.resume()
+        return False
+
+    def _accept(self) -> Reaction:
+        """Is a contact elsewhere than planned? Then the rest is planned from there."""
+        actual = tuple(self.estimate.substitute(c) or c for c in self.stance)
+        for c, planned in zip(actual, self.stance, strict=True):
+            up, side = self.estimate.deviation(c)
             if c is not planned or abs(up) > DEVIATION or side > DRIFT:
                 self._note_moved(c, planned, made=False)
                 yield from self._replan(actual, actual)
-                return
+                return True
+        return False
 
-    def _end(self) -> Ticks:
-        """Hold the last posture."""
-        n = round(HOLD_END / PHYSICS_STEP)
-        self._velocity = np.zeros(len(self._dadr))
-        for k in range(n):
-            self.left = n - 1 - k
-            if self.left == 0:
-                self._sum_up()
-            yield
-
-    # Actions.
-
-    def _play(self, to: int, until: Callable[[], bool] | None = None) -> Ticks:
-        """Follow the trajectory to sample `to`, or until something happens."""
-        t = self._trajectory
-        while self._i < to:
-            if until is not None and until():
-                return
-            self._i += 1
-            self._set(t, self._i)
-            self._blend()
-            yield
-
-    def _back(self, to: int) -> Ticks:
-        """Follow the trajectory back to sample `to`."""
-        self._left_plan = True
-        while self._i > to:
-            self._i -= 1
-            self._set(self._trajectory, self._i)
-            self._velocity = -self._velocity
-            yield
-
-    def _set(self, t: Trajectory, i: int) -> None:
-        self.reference, self._torque = t.q[i], t.tau[i]
-        self._velocity, self._closed = t.v[i][self._dadr], t.contact[i]
-
-    def _resume(self) -> None:
-        """Back to the trajectory that was left, little by little while it goes on."""
-        t, i = self._trajectory, self._i
-        offset = self._kin.difference(t.q[i], self.reference)
-        self._return = (offset, self._torque - t.tau[i], 0)
-
-    def _blend(self) -> None:
-        """Add what is left of the way back."""
-        if self._return is None:
-            return
-        offset, torque, k = self._return
-        n = round(BLEND / PHYSICS_STEP)
-        share = 0.5 + 0.5 * np.cos(np.pi * k / n)
-        rate = -0.5 * np.pi / BLEND * np.sin(np.pi * k / n)
-        self.reference = self._kin.integrate(self.reference, share * offset)
-        self._torque = self._torque + share * torque
-        self._velocity = self._velocity + rate * offset[self._dadr]
-        self._return = (offset, torque, k + 1) if k < n else None
-
-    def _rest(self, seconds: float) -> Ticks:
-        """Stand still."""
-        self._velocity = np.zeros(len(self._dadr))
-        self._left_plan = True
-        for _ in range(round(seconds / PHYSICS_STEP)):
-            yield
-
-    def _feel(self, c: Contact) -> Iterator[None]:
-        """Go on along the normal; returns the contact that is felt, or None.
+    def _probe(self, c: Contact) -> Generator[None, None, Contact | None]:
+        """Go on along the normal; returns the contact that is found, or None.
 
         Another surface of the limb that meets the support first is the contact.
         """
-        stance = self._keyframes[self._leg].stance
-        if self._leg < len(self._legs) and self._legs[self._leg].made is c:
-            after = {x.surface for x in self._keyframes[self._leg + 1].stance}
+        stance = self.stance
+        if self._next_contact() is c:
+            after = {x.surface for x in self._keyframes[self._change + 1].stance}
             stance = tuple(x for x in stance if x.surface in after)
         held = tuple(x for x in stance if x.surface != c.surface)
-        t = feeling(self._world, held, c, self._trajectory.q[self._i])
-        self._left_plan = True
-        if t is None:
-            return None
-        for i in range(len(t.time)):
-            self._set(t, i)
-            yield
-            felt = c if self._touches(c, REACH) else self._other(c)
-            if felt is not None:
-                self._velocity = np.zeros(len(self._dadr))
-                return felt
-        for i in reversed(range(len(t.time))):
-            self._set(t, i)
-            self._velocity = -self._velocity
-            yield
-        return None
+        ref, estimate = self._ref, self.estimate
+        t = feeling(estimate.world, held, c, ref.trajectory.q[ref.i])
+        ref.left_plan = True
+        found: Contact | None = None
+
+        def touches() -> bool:
+            nonlocal found
+            found = c if estimate.touches(c, REACH) else estimate.substitute(c)
+            return found is not None
+
+        if t is not None:
+            yield from ref.aside(t, touches)
+        return found
 
     def _replan(self, contacts: Sequence[Contact], loaded: Sequence[Contact]) -> Ticks:
         """Take the stance as it is and plan the remaining steps again."""
-        yield from self._rest(LOOK)
-        off = max(max(abs(u), s) for u, s in (self._off(c) for c in contacts))
-        if len(contacts) < len(self._keyframes[self._leg].stance):
+        yield from self._ref.rest(LOOK)
+        estimate = self.estimate
+        off = max(max(abs(u), s) for u, s in map(estimate.deviation, contacts))
+        if len(contacts) < len(self.stance):
             off = np.inf  # without a contact there is no going on as planned
-        bearing = [c in loaded for c in contacts]
-        felt = [self._as_felt(c) for c in contacts]
-        self._remember(felt)
+        measured = {c: estimate.measured(c) for c in contacts}
+        estimate.remember(list(measured.values()), self.done)
+        q = self.reference.copy()  # joints as commanded, base as measured
+        q[:7] = estimate.q[:7]
         now = State(
-            done=self._made,
-            stance=tuple(felt),
-            loaded=tuple(c for c, b in zip(felt, bearing, strict=True) if b),
-            q=self._rebased(),
+            stance=tuple(measured.values()),
+            loaded=tuple(x for c, x in measured.items() if c in loaded),
+            q=q,
+            done=self.done,
         )
-        found = adapt_plan(
-            self._plan, self._believed(), now, self.reference, self._wary
-        )
-        yield from self._rest(THINKING)
+        scene = estimate.scene(self._plan.world.scene)
+        found = adapt_plan(self._plan, scene, now, self.reference, self._clearance)
+        yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
     def _follow(self, found: Plan, off: float) -> Ticks:
         """Go by another plan; or, where that is worse, by the one at hand."""
-        missed = str(found.failures[0]) if found.failures else ""
-        no_better = bool(missed) and off < FALLBACK and not self._missed
-        if found.trajectory is None or no_better:
-            yield from self._go_on(off, missed)
+        why = str(found.failures[0]) if found.failures else ""
+        if found.trajectory is None or (why and off < FALLBACK and not self._failure):
+            yield from self._keep_plan(off, why)
             return
-        steps = len(found.changes)
-        if missed and steps == 0:
-            self._stop(missed)
+        changes = len(found.changes)
+        if why and changes == 0:
+            self._stop(why)
             return
-        self._note(Replanned, changes=steps)
-        self._adopt(found, found.trajectory)
-        self._i = round(HOLD_START / PHYSICS_STEP) - 1
-        if steps == 0 and not self._more:  # there is still the way to the last posture
-            yield from self._play(_arrival(found.trajectory))
+        self._note(Replanned, changes=changes)
+        self._adopt(found, found.trajectory, FIRST)
+        if changes == 0 and not self._goes_on:
+            # There is still the way to the last posture.
+            yield from self._ref.play(found.trajectory.segments[-1].begin - 1)
 
-    def _go_on(self, off: float, why: str) -> Ticks:
+    def _keep_plan(self, off: float, why: str) -> Ticks:
         """No other plan was found: the one at hand may do, or may not."""
-        if self._steps and self._made == len(self._steps):
+        if self._steps and self.done == self._steps:
             self._note(NotReplanned, why=why, stays=True)
-            self._leg = len(self._legs)
+            self._change = len(self._spans)
         elif off < FALLBACK:
             self._note(NotReplanned, why=why, stays=False)
-            self._resume()
-            if self._leg > 0:
-                yield from self._play(self._legs[self._leg - 1].end)
+            self._ref.resume()
+            if self._change > 0:
+                yield from self._ref.play(self._spans[self._change - 1].end)
         else:
             self._stop(why)
 
@@ -546,14 +513,13 @@ class Execution:
 
     # What it knows.
 
-    def _adopt(self, plan: Plan, trajectory: Trajectory) -> None:
-        self._world, self._kin = plan.world, Kinematics(plan.world)
-        self._trajectory, self._i = trajectory, 0
-        self._keyframes = list(plan.keyframes)
-        self._legs, self._leg = _legs(trajectory, plan.keyframes), 0
-        self._missed = str(plan.failures[0]) if plan.failures else ""
-        self._more = not plan.complete and not plan.failures  # a policy goes on
-        self._return: tuple[np.ndarray, np.ndarray, int] | None = None
+    def _adopt(self, plan: Plan, trajectory: Trajectory, sample: int) -> None:
+        self.estimate.believe(plan.world)
+        self._ref.follow(trajectory, sample)
+        self._at_hand, self._keyframes = plan, plan.keyframes
+        self._spans, self._change = _spans(plan, trajectory), 0
+        self._failure = str(plan.failures[0]) if plan.failures else ""
+        self._goes_on = not plan.complete and not plan.failures  # a policy does
 
     @property
     def _time(self) -> float:
@@ -563,246 +529,95 @@ class Execution:
         self.events.append(kind(time=self._time, **what))
 
     def _note_moved(self, c: Contact, planned: Contact, *, made: bool) -> None:
-        above, aside = self._off(c)
-        self._note(
-            ContactMoved,
-            surface=c.surface,
-            planned=planned.surface,
-            above=above,
-            aside=aside,
-            made=made,
-        )
+        above, aside = self.estimate.deviation(c)
+        names = {"surface": c.surface, "planned": planned.surface}
+        self._note(ContactMoved, **names, above=above, aside=aside, made=made)
 
-    def _sense(self, m: Measurement) -> None:
-        self._load += PHYSICS_STEP / FORCE_SMOOTHING * (m.force - self._load)
-        q = self._pose
-        if m.q[3:7] @ q[3:7] < 0:
-            q[3:7] *= -1
-        q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
-        q[3:7] /= math.sqrt(q[3:7] @ q[3:7])
+    def _count_change(self) -> None:
+        """The present contact change has been done."""
+        index = self._at_hand.changes[self._change].step.index
+        self._change += 1
+        if index is not None:
+            self.done = index + 1
+        self._reached.append(self._ref.seconds)
+
+    def _sense(self, measured: Measurement) -> None:
+        self.estimate.update(measured)
         if self._slow and self._k % LOOK_STRIDE == 0:
-            if is_leaning(self._load, self._weight) or self._struck():
-                self._leaning += LOOK_STRIDE * PHYSICS_STEP
+            if load_is_missing(self.estimate.load, self._weight) or self._hit():
+                self._unintended_for += LOOK_STRIDE * PHYSICS_STEP
             else:
-                self._leaning = 0.0
+                self._unintended_for = 0.0
 
     def _balanced(self) -> np.ndarray:
         """(nq,) the reference, its centre of mass moved where balance asks for it."""
         if not self._slow:  # in faster motion the robot need not balance statically
             return self.reference
         if self._k % LOOK_STRIDE == 0:
-            self._balance.feel(self._pose, self.reference, self._closed_contacts())
+            closed = self._closed_contacts()
+            self._balance.update(self.estimate.q, self.reference, closed)
         q = self.reference.copy()
         q[self._qadr] += self._balance.offset(PHYSICS_STEP)
         return q
 
+    def _near_contacts(self) -> Iterable[Contact]:
+        """Of the keyframes before and after."""
+        near = self._keyframes[self._change : self._change + 2]
+        return (c for key in near for c in key.stance)
+
     def _closed_contacts(self) -> list[Contact]:
         """Those of the plan at present."""
-        near = self._keyframes[self._leg : self._leg + 2]
-        contacts = {c.surface: c for key in near for c in key.stance}
-        index = self._surfaces.index
-        return [c for s, c in contacts.items() if self._closed[index(s)]]
+        closed, row = self._ref.closed, self.estimate.row
+        contacts = {c.surface: c for c in self._near_contacts()}
+        return [c for s, c in contacts.items() if closed[row(s)]]
 
-    def _struck(self) -> list[str]:
-        """Surfaces, neither in contact nor about to be, that strike a side."""
-        hit = [self._surfaces[i] for i in np.flatnonzero(strikes(self._load))]
-        if not hit:
-            return hit
-        j = self._leg
-        near = {c.surface for key in self._keyframes[j : j + 2] for c in key.stance}
-        others = map(self._other, self._keyframes[j].stance)
+    def _hit(self) -> list[str]:
+        """Surfaces, neither in contact nor about to be, that hit a side."""
+        rows = np.flatnonzero(hit_sideways(self.estimate.load))
+        if not len(rows):
+            return []
+        near = {c.surface for c in self._near_contacts()}
+        others = map(self.estimate.substitute, self.stance)
         near.update(c.surface for c in others if c is not None)
-        made = self._next_made()
-        if made is not None:
-            near.update(self._world.robot.limb_of(made.surface).surfaces)
+        makes = self._next_contact()
+        if makes is not None:
+            near.update(self._plan.world.robot.limb_of(makes.surface).surfaces)
+        hit = [self.estimate.surfaces[i] for i in rows]
         return [s for s in hit if s not in near]
 
-    def _next_made(self) -> Contact | None:
-        """The contact that the present step makes, if any."""
-        return self._legs[self._leg].made if self._leg < len(self._legs) else None
+    def _next_contact(self) -> Contact | None:
+        """The contact that the present change makes, if any."""
+        on_way = self._change < len(self._spans)
+        return self._spans[self._change].makes if on_way else None
 
-    def _leans(self) -> bool:
-        """Whether something leans where it should not: then `_lean` says what."""
-        if self._leaning < LEANING or self._withdrawals == WITHDRAWALS:
+    def _is_unintended(self) -> bool:
+        """Is a link loaded where it should not be? Then `_unintended` says which."""
+        if self._unintended_for < UNINTENDED or self._retreats == RETREATS:
             return False
-        self._leaning = 0.0
-        self._kin.update(self._pose)
-        if is_leaning(self._load, self._weight):
-            self._lean = leaning_part(self._kin, self._load, self._weight)
+        self._unintended_for = 0.0
+        estimate, kin = self.estimate, self.estimate.kin
+        kin.update(estimate.q)
+        if load_is_missing(estimate.load, self._weight):
+            found = loaded_link(kin, estimate.load, self._weight)
         else:
-            self._lean = striking_part(self._kin, self._struck())
-        lean = self._lean
-        if lean and (
-            self._moves(lean.geom) or (lean.geom, lean.support) in self._stays
+            found = nearest_of(kin, self._hit())
+        if found and (
+            self._is_moving(found.geom) or (found.geom, found.support) in self._accepted
         ):
-            self._lean = None
-        return self._lean is not None
+            found = None
+        self._unintended = found
+        return found is not None
 
-    def _moves(self, geom: int) -> bool:
+    def _is_moving(self, geom: int) -> bool:
         """Whether a geom is of the limb on its way: that grazes an edge and goes on."""
-        made = self._next_made()
-        body = int(self._world.model.geom_bodyid[geom])
-        return made is not None and body in limb_links(self._world, made.surface)
+        makes, world = self._next_contact(), self.estimate.world
+        body = int(world.model.geom_bodyid[geom])
+        return makes is not None and body in limb_links(world, makes.surface)
 
-    def _force(self, c: Contact) -> float:
-        """Normal force on a surface [N]."""
-        n = self._world.supports[c.support].normal
-        return float(self._load[self._surfaces.index(c.surface)] @ n)
-
-    def _touches(self, c: Contact, aside: float = NEAR) -> bool:
-        """Force on the surface, not far from where its contact was planned."""
-        if self._force(c) < TOUCH:
-            return False
-        up, side = self._off(c)
-        return side < aside and abs(up) < REACH + 0.02
-
-    def _other(self, c: Contact) -> Contact | None:
-        """The contact of another surface of the limb that bears in place of this."""
-        if self._force(c) >= LOST:
-            return None
-        support = self._world.supports[c.support]
-        for surface in self._plan.world.robot.limb_of(c.surface).surfaces:
-            other = replace(c, surface=surface, edge=None, link=None)
-            if surface != c.surface and self._force(other) >= TOUCH:
-                p = self._point(other)
-                there = support.inside(p) and abs(support.height(p)) < REACH
-                if there and self._lies(surface, support.normal):
-                    return replace(other, position=p)
-        return None
-
-    def _lies(self, surface: str, normal: np.ndarray) -> bool:
-        """Whether a surface lies on a support rather than touching with a corner.
-
-        Only then its middle is where the support is. The kinematics are up to date.
-        """
-        s = self._world.surfaces[surface]
-        if s.rotation is None:
-            return True
-        up = (self._kin.rotation(s.body) @ s.rotation)[:, 2]
-        return float(up @ normal) > math.cos(TILTED)
-
-    def _point(self, c: Contact) -> np.ndarray:
-        """(3,) where the surface's lowest point is by the sensors."""
-        self._kin.update(self._pose)
-        n = self._world.supports[c.support].normal
-        return self._kin.contact_point(c.surface, n, c.edge)
-
-    def _off(self, c: Contact) -> tuple[float, float]:
-        """How far a contact is from its plan, along the normal and sideways [m]."""
-        n = self._world.supports[c.support].normal
-        off = self._point(c) - c.position - self._kin.roll(c.surface, n, c.link)
-        up = float(off @ n)
-        return up, float(np.linalg.norm(off - up * n))
-
-    def _as_felt(self, c: Contact) -> Contact:
-        """The contact where it is by the sensors."""
-        self._kin.update(self._pose)
-        return felt_contact(self._kin, c)
-
-    def _remember(self, contacts: Sequence[Contact]) -> None:
-        """Where supports have been felt, one place for each contact made."""
-        for c in contacts:
-            if c.support != GROUND:
-                p = self._point(c)
-                near = (
-                    k
-                    for k, (_, x) in self._felt.items()
-                    if k[0] == c.surface and np.linalg.norm(x[:2] - p[:2]) < SAME_PLACE
-                )
-                key = next(near, (c.surface, self._made))
-                self._felt[key] = (c.support, p)
-
-    def _believed(self) -> Scene:
-        """The scene as it is by what was felt; the start where the robot began."""
-        scene = believed_scene(self._plan.world.scene, self._felt.values())
-        return replace(scene, start=self._world.scene.start)
-
-    def _rebased(self) -> np.ndarray:
-        """(nq,) joint angles as commanded, base as measured."""
-        q = self.reference.copy()
-        q[:7] = self._pose[:7]
-        return q
-
-    def _tick_off(self, leg: _Leg) -> None:
-        """Count the steps of the sequence that have been made."""
-        a, b = (self._keyframes[j].stance for j in (self._leg - 1, self._leg))
-        gone = {c.surface for c in a} - {c.surface for c in b}
-        for k in range(self._made, len(self._steps)):
-            step = self._steps[k]
-            if leg.made is None:
-                same = step.makes is None and set(step.breaks) == gone
-            else:
-                same = (
-                    step.makes is not None
-                    and step.makes.surface == leg.made.surface
-                    and step.makes.support == leg.made.support
-                )
-            if same:
-                self._made = k + 1
-                return
-
-    def _sum_up(self) -> None:
+    def _resting(self) -> Iterable[str]:
         """Which contacts the robot rests on: those of the stance, as they are."""
-        out = []
-        for c in self._keyframes[self._leg].stance:
+        for c in self.stance:
             for surface in self._plan.world.robot.limb_of(c.surface).surfaces:
                 other = replace(c, surface=surface)
-                if surface == c.surface or self._force(other) >= LOST:
-                    out.append(f"{surface}@{c.support}")
-        self.rests_on = tuple(out)
-
-    def _self_positioning(self) -> np.ndarray | None:
-        """(na,) share to which ankles of planted feet position themselves (4.32).
-
-        From when both arms bear load until a foot must step again; eased in and out.
-        """
-        if not self._ankles:
-            return None
-        up = self._load[:, 2].tolist()
-        bearing = all(any(up[i] > TOUCH for i in rows) for rows in self._arms)
-        t = self._trajectory
-        ahead = t.contact[min(self._i + round(AHEAD / PHYSICS_STEP), len(t.time) - 1)]
-        rate = PHYSICS_STEP / EASING
-        for surface, joints in self._ankles.items():
-            s = self._surfaces.index(surface)
-            free = bearing and self._closed[s] and ahead[s]
-            share = float(self._positioned[joints][0]) + (rate if free else -rate)
-            self._positioned[joints] = min(max(share, 0.0), 1.0)
-        return self._positioned
-
-
-def _ankles(world: World) -> dict[str, np.ndarray]:
-    """(na,) bool by foot: the joints of its leg that position themselves."""
-    m = world.model
-    own = [j in world.robot.self_positioning for j in world.joints]
-    bodies = [int(m.jnt_bodyid[m.joint(j).id]) for j in world.joints]
-    out = {}
-    for limb in world.robot.limbs.values():
-        foot = limb.surfaces[0]
-        chain = chain_up(m, world.surfaces[foot].body)
-        joints = np.array([o and b in chain for o, b in zip(own, bodies, strict=True)])
-        if joints.any() and not limb.is_arm:
-            out[foot] = joints
-    return out
-
-
-def _legs(t: Trajectory, keyframes: Sequence[Keyframe]) -> list[_Leg]:
-    """The contact changes of a trajectory."""
-    out = []
-    for j, (before, after) in enumerate(itertools.pairwise(keyframes)):
-        parts = [x for x in t.segments if x.change == j]
-        begin, end = t.at(float(t.keyframes[j])), parts[-1].end - 1
-        making = next((x for x in parts if x.makes is not None), None)
-        if making is None:
-            out.append(_Leg(begin, begin, end, end, None))
-            continue
-        # A limb that is in the air swings from the start.
-        gone = {c.surface for c in before.stance} - {c.surface for c in after.stance}
-        swing = making.begin if gone else begin
-        out.append(_Leg(begin, swing, making.end - 1, end, making.makes))
-    return out
-
-
-def _arrival(t: Trajectory) -> int:
-    """The sample from which on the last posture is held."""
-    return len(t.time) - 1 - round(HOLD_END / PHYSICS_STEP)
+                if surface == c.surface or self.estimate.force(other) >= LOST:
+                    yield f"{surface}@{c.support}"

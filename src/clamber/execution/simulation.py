@@ -6,9 +6,8 @@ every step, so that plain MuJoCo arrives at the same states from the first one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -16,10 +15,9 @@ import numpy as np
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Event, Stopped
-from clamber.execution.executive import Execution, Tracking
+from clamber.execution.executive import Executive, OpenLoop
 from clamber.execution.perturbed import perturbed_world, push_of
 from clamber.execution.sensors import (
-    Measurement,
     Sensors,
     contact_forces,
     rows_of_geoms,
@@ -92,39 +90,6 @@ class Rollout:
         return next((e.why for e in self.events if isinstance(e, Stopped)), "")
 
 
-class Controller(Protocol):
-    """What drives the robot, one call for each physics step."""
-
-    def command(self, measured: Measurement) -> np.ndarray:
-        """(na,) servo command of the next physics step."""
-        ...
-
-    @property
-    def reference(self) -> np.ndarray:
-        """(nq,) of the last command."""
-        ...
-
-    @property
-    def left(self) -> int:
-        """Physics steps to the end, as far as is known."""
-        ...
-
-    @property
-    def followed(self) -> Trajectory | None:
-        """What was followed, where that is not the plan."""
-        ...
-
-    @property
-    def events(self) -> Sequence[Event]:
-        """What was measured so far, and done about it."""
-        ...
-
-    @property
-    def rests_on(self) -> tuple[str, ...]:
-        """Contacts at the end, by `surface@support`."""
-        ...
-
-
 def simulate(
     plan: Plan,
     *,
@@ -158,20 +123,20 @@ def simulate(
             value=(d.x, d.y, d.yaw),
         )
     world = driven_world(perturbed_world(plan.world, d, true_scene), controller)
-    follows = (Tracking if controller == "pid" else Execution)(plan, world)
+    follower = (OpenLoop if controller == "pid" else Executive)(plan, world)
     rng = np.random.default_rng([d.seed, 1])
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
     push = push_of(d, float(plan.trajectory.time[-1]))
     report = progress or (lambda stage, share, note: None)
     start = world.home if plan.state is None else plan.state.q
     planned = len(plan.trajectory.time)
-    return _run(world, start, follows, sensors, push, planned, report)
+    return _run(world, start, follower, sensors, push, planned, report)
 
 
 def _run(
     world: World,
     start: np.ndarray,
-    controller: Controller,
+    controller: OpenLoop | Executive,
     sensors: Sensors,
     push: np.ndarray | None,
     planned: int,

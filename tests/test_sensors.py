@@ -50,8 +50,8 @@ def stood(world) -> mujoco.MjData:
 
 
 def rows_of(world: World) -> np.ndarray:
-    """(ngeom,) which surface a geom belongs to."""
-    out = np.full(world.model.ngeom, -1)
+    """(ngeom,) which surface a geom belongs to, by its name; -2: of the scene."""
+    out = np.where(world.model.geom_bodyid == 0, -2, -1)
     for g in range(world.model.ngeom):
         name = world.model.geom(g).name
         for i, s in enumerate(world.surfaces):

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from clamber.execution.servo import INTEGRAL_LIMIT, JointLaw, driven_world
+from clamber.execution.servo import INTEGRAL_LIMIT, JointServo, driven_world
 from clamber.model.world import PHYSICS_STEP
 
 
@@ -14,7 +14,7 @@ class PID:
     """The law on the samples of a trajectory."""
 
     def __init__(self, world, trajectory):
-        self.law, self.world, self.trajectory = JointLaw(world), world, trajectory
+        self.law, self.world, self.trajectory = JointServo(world), world, trajectory
 
     def command(self, k: int, q: np.ndarray) -> np.ndarray:
         w, t = self.world, self.trajectory
@@ -178,7 +178,7 @@ def test_only_servos_differ_between_the_worlds_of_the_modes(demo_plan):
 def test_a_joint_that_positions_itself_is_left_its_feed_forward(demo_plan):
     """(4.32): the measured angle is the reference, whatever the error has been."""
     world = demo_plan.world
-    law, n = JointLaw(world), len(world.joints)
+    law, n = JointServo(world), len(world.joints)
     free = np.zeros(n)
     free[3] = 1.0
     q, tau = np.zeros(n), np.full(n, 2.0)

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 
 from clamber.execution.disturbance import Disturbance
-from clamber.execution.leaning import (
+from clamber.execution.events import Unintended
+from clamber.execution.simulation import simulate
+from clamber.execution.unintended import (
     AWAY,
     MISSING,
     SEARCHED,
     SIDEWAYS,
     UP,
-    is_leaning,
-    leaning_part,
-    strikes,
-    striking_part,
+    hit_sideways,
+    load_is_missing,
+    loaded_link,
+    nearest_of,
 )
-from clamber.execution.simulation import simulate
 from clamber.execution.verdict import judge
 from clamber.model.kinematics import Kinematics
 
@@ -84,8 +85,8 @@ def test_the_arm_that_leans_is_found(kin, demo_plan, weight, side, share, sidewa
     p = lowest(kin, f"{side}UpperArm")
     force = share * weight * np.array([sideways, 0.0, 1.0])
     load = loads(kin, demo_plan.keyframes[-1].stance, weight, force, p)
-    assert is_leaning(load, weight)
-    lean = leaning_part(kin, load, weight)
+    assert load_is_missing(load, weight)
+    lean = loaded_link(kin, load, weight)
     assert lean is not None
     assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
     assert lean.support == "box"
@@ -103,7 +104,7 @@ def test_it_is_found_through_the_noise_of_the_forces(kin, demo_plan, weight, rng
         for _ in range(50):
             noisy = load * (1.0 + rng.normal(0.0, 0.02, (len(load), 1)))
             noisy += rng.normal(0.0, 1.0, load.shape)  # what the smoothing leaves
-            lean = leaning_part(kin, noisy, weight)
+            lean = loaded_link(kin, noisy, weight)
             assert lean is not None
             assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
 
@@ -123,7 +124,7 @@ def test_it_is_found_wherever_soles_are_borne(demo_plan, weight, side, end):
     }
     p = lowest(kin, f"{side}UpperArm")
     load = loads(kin, key.stance, weight, 0.2 * weight * UP, p, borne)
-    lean = leaning_part(kin, load, weight)
+    lean = loaded_link(kin, load, weight)
     assert lean is not None
     assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
 
@@ -132,7 +133,7 @@ def test_where_no_part_is_near_the_force_nothing_is_found(kin, demo_plan, weight
     stance = demo_plan.keyframes[-1].stance
     p = lowest(kin, "LUpperArm") + np.array([0.0, 2.0 * AWAY, 0.0])
     load = loads(kin, stance, weight, 0.2 * weight * UP, p)
-    assert leaning_part(kin, load, weight) is None
+    assert loaded_link(kin, load, weight) is None
 
 
 def test_high_above_all_supports_nothing_is_found(demo_plan, weight):
@@ -141,8 +142,8 @@ def test_high_above_all_supports_nothing_is_found(demo_plan, weight):
     q[2] += 0.5
     kin.update(q)
     load = np.zeros((len(kin.world.surfaces), 3))
-    assert leaning_part(kin, load, weight) is None
-    assert striking_part(kin, ["LHand"]) is None
+    assert loaded_link(kin, load, weight) is None
+    assert nearest_of(kin, ["LHand"]) is None
 
 
 def test_a_surface_is_never_what_leans(kin, demo_plan, weight):
@@ -152,7 +153,7 @@ def test_a_surface_is_never_what_leans(kin, demo_plan, weight):
     for c in stance:
         p = kin.contact_point(c.surface, UP)
         load = loads(kin, stance, weight, 0.2 * weight * UP, p)
-        lean = leaning_part(kin, load, weight)
+        lean = loaded_link(kin, load, weight)
         assert lean is None or lean.geom not in own
 
 
@@ -160,10 +161,10 @@ def test_a_surface_is_never_what_leans(kin, demo_plan, weight):
 def test_it_takes_a_share_of_the_weight(share, leans):
     load = np.zeros((3, 3))
     load[1, 2] = (1.0 - share * MISSING) * 250.0
-    assert is_leaning(load, 250.0) == leans
+    assert load_is_missing(load, 250.0) == leans
 
 
-def test_a_surface_that_bears_strikes_no_side():
+def test_a_surface_that_is_loaded_hits_no_side():
     f = np.array(
         [
             [0.9 * SIDEWAYS, 0.0, 0.0],  # too little
@@ -173,12 +174,12 @@ def test_a_surface_that_bears_strikes_no_side():
             [-40.0, 30.0, -5.0],
         ]
     )
-    assert strikes(f).tolist() == [False, True, False, True, True]
+    assert hit_sideways(f).tolist() == [False, True, False, True, True]
 
 
-def test_what_strikes_is_the_geom_nearest_to_a_support(kin):
+def test_what_hits_a_side_is_the_geom_nearest_to_a_support(kin):
     world = kin.world
-    lean = striking_part(kin, ["LHand", "LElbow"])
+    lean = nearest_of(kin, ["LHand", "LElbow"])
     assert lean is not None
     near = kin.proximity(SEARCHED)
     own = set(world.surfaces["LHand"].geoms) | set(world.surfaces["LElbow"].geoms)
@@ -209,7 +210,7 @@ def test_an_arm_that_leans_on_a_tile_is_lifted_off(demo_plan, seed):
         ),
     }  # fmt: skip
     rollout = simulate(demo_plan, disturbance=known[seed])
-    assert any("leans on box" in e.text for e in rollout.events)
+    assert any(isinstance(e, Unintended) and e.support == "box" for e in rollout.events)
     assert judge(demo_plan, rollout).reached
     # What felt nothing of it would lie there for seconds.
     longest = run = 0

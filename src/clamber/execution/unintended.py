@@ -1,14 +1,14 @@
-"""Contact forces as felt -> the part of the robot that bears where it should not.
+"""Measured contact forces -> the link that carries load where no contact is planned.
 
-What the surfaces bear is less than the weight: another part bears the rest. Motion is
-slow, so forces and moments balance, those of gravity, of the surfaces and of that part:
+What the surfaces carry is less than the weight: another link carries the rest. Motion
+is slow, so forces and moments balance, those of gravity, of the surfaces and of it:
 
     F = -(m g + sum f_i),        p x F = -(c x m g + sum p_i x f_i).
 
 The second says where on a plane the line of F passes, up to what the noise of the
-forces leaves, a few centimetres, and up to where on its sole a foot is borne, which is
-not felt. That tells one arm from the other, and the part is the one that comes nearest
-to a support there.
+forces leaves, a few centimetres, and up to where on its sole a foot carries its load,
+which is not measured. That tells one arm from the other, and the link is the one that
+comes nearest to a support there.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ import numpy as np
 
 from clamber.model.kinematics import Kinematics
 
-MISSING = 0.08  # of the weight that the surfaces do not bear
-SIDEWAYS = 15.0  # [N] and more than the force upwards: a surface strikes a side
-SEARCHED = 0.06  # [m] a support is believed no farther from what leans on it
+MISSING = 0.08  # of the weight that the surfaces do not carry
+SIDEWAYS = 15.0  # [N] and more than the force upwards: a surface hits a side
+SEARCHED = 0.06  # [m] a support is believed no farther from what touches it
 AWAY = 0.20  # [m] from the line of the force, besides what soles leave open
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
-class Lean:
-    """What leans on what.
+class UnintendedContact:
+    """What touches what.
 
     Attributes:
         geom: Of the robot, in the model.
@@ -42,22 +42,24 @@ class Lean:
     distance: float
 
 
-def is_leaning(load: np.ndarray, weight: float) -> bool:
+def load_is_missing(load: np.ndarray, weight: float) -> bool:
     """Whether forces (nS, 3) of the surfaces [N] are less than the weight [N]."""
     return weight - load[:, 2].sum() > MISSING * weight
 
 
-def strikes(load: np.ndarray) -> np.ndarray:
+def hit_sideways(load: np.ndarray) -> np.ndarray:
     """(nS,) bool: a surface is pushed sideways more than upwards, forces (nS, 3) [N].
 
-    No contact on a level support bears like that, at a friction of up to 1.
+    No contact on a level support is loaded like that, at a friction of up to 1.
     """
     sideways = np.hypot(load[:, 0], load[:, 1])
     return sideways > np.maximum(SIDEWAYS, load[:, 2])
 
 
-def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | None:
-    """The part, none of the surfaces, that bears what these do not.
+def loaded_link(
+    kin: Kinematics, load: np.ndarray, weight: float
+) -> UnintendedContact | None:
+    """The link, none of the surfaces, that carries what these do not.
 
     Args:
         kin: In the posture as measured, of the world as believed.
@@ -65,7 +67,7 @@ def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | Non
         weight: Of the robot [N].
 
     Returns:
-        None where no part is near a support on the line of the force.
+        None where no link is near a support on the line of the force.
     """
     world = kin.world
     down = np.array([0.0, 0.0, -weight])
@@ -75,13 +77,13 @@ def leaning_part(kin: Kinematics, load: np.ndarray, weight: float) -> Lean | Non
     open_ = _moment_of_soles(kin, load) / max(force[2], 1e-9)
     own = [g for s in world.surfaces.values() for g in s.geoms]
     best, found = SEARCHED + AWAY, None
-    for lean, p in _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) == 0):
+    for near, p in _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) == 0):
         # p x F = M in the plane z = p_z.
         x = (p[2] * force[0] - moment[1]) / force[2]
         y = (p[2] * force[1] + moment[0]) / force[2]
         away = max(float(np.hypot(x - p[0], y - p[1])) - open_, 0.0)
-        if away < AWAY and max(lean.distance, 0.0) + away < best:
-            best, found = max(lean.distance, 0.0) + away, lean
+        if away < AWAY and max(near.distance, 0.0) + away < best:
+            best, found = max(near.distance, 0.0) + away, near
     return found
 
 
@@ -94,18 +96,18 @@ def _moment_of_soles(kin: Kinematics, load: np.ndarray) -> float:
     return float(np.maximum(load[:, 2], 0.0) @ half)
 
 
-def striking_part(kin: Kinematics, surfaces: Collection[str]) -> Lean | None:
+def nearest_of(kin: Kinematics, surfaces: Collection[str]) -> UnintendedContact | None:
     """The geom of some surfaces that is nearest to a support; None where none is."""
     world = kin.world
     own = [g for s in surfaces for g in world.surfaces[s].geoms]
     near = _near_supports(kin, np.isin(world.pairs, own).sum(axis=1) > 0)
-    return min((lean for lean, _ in near), key=lambda x: x.distance, default=None)
+    return min((x for x, _ in near), key=lambda x: x.distance, default=None)
 
 
 def _near_supports(
     kin: Kinematics, active: np.ndarray
-) -> list[tuple[Lean, np.ndarray]]:
-    """Parts near a support among pairs (P,), each with its nearest point (3,)."""
+) -> list[tuple[UnintendedContact, np.ndarray]]:
+    """Geoms near a support among pairs (P,), each with its nearest point (3,)."""
     world = kin.world
     supports = list(world.support_of_geom)
     of_support = np.isin(world.pairs, supports)
@@ -116,6 +118,7 @@ def _near_supports(
     ):
         first = int(of_support[k, 0])  # the robot's is the other one
         geom, other = int(world.pairs[k, first]), int(world.pairs[k, 1 - first])
-        lean = Lean(geom, world.support_of_geom[other], float(distance))
-        out.append((lean, b if first else a))
+        support = world.support_of_geom[other]
+        touch = UnintendedContact(geom, support, float(distance))
+        out.append((touch, b if first else a))
     return out

@@ -1,0 +1,148 @@
+"""Measurements -> where the robot is, what it touches, and what the boxes are like.
+
+Posture and forces are filtered; a contact is judged by the force on its surface and by
+where the posture says that this is. Heights measured on boxes make the scene that is
+believed (`terrain`). Nothing here acts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from clamber.contact.contact import Contact
+from clamber.execution.sensors import Measurement
+from clamber.execution.terrain import believed_scene
+from clamber.model.kinematics import Kinematics
+from clamber.model.scene import GROUND, Scene
+from clamber.model.world import PHYSICS_STEP, World
+from clamber.planning.adaptation import REACH, felt_contact
+
+TOUCH = 10.0  # [N] normal force that is a contact
+LOST = 1.5  # [N] a contact of the stance that carries less is lost
+FORCE_SMOOTHING = 0.03  # [s] time constant of the forces
+POSE_SMOOTHING = 0.01  # [s] ... and of the measured posture: it must not lag a touch
+TILTED = 0.35  # [rad] a sole that is more so touches with a corner
+NEAR = 0.06  # [m] sideways from the planned place, a touch is that contact
+SAME_PLACE = 0.05  # [m] a surface that lands again this near replaces what was measured
+
+
+class Estimate:
+    """What is known of one robot in a world that is believed in.
+
+    Attributes:
+        world: As it is believed to be; kin: a workspace of it.
+        surfaces: Names of the nS surfaces.
+        q: (nq,) filtered posture.
+        load: (nS, 3) filtered forces on the surfaces [N], world axes.
+    """
+
+    def __init__(self, world: World, q: np.ndarray) -> None:
+        """Begin in posture `q` (nq,), nothing loaded."""
+        self.believe(world)
+        self.surfaces = tuple(world.surfaces)
+        self.q = q.copy()
+        self.load = np.zeros((len(self.surfaces), 3))
+        self._measured: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
+
+    def believe(self, world: World) -> None:
+        """Take the world to be like this."""
+        self.world, self.kin = world, Kinematics(world)
+
+    def update(self, m: Measurement) -> None:
+        """Take in the measurement of one physics step."""
+        self.load += PHYSICS_STEP / FORCE_SMOOTHING * (m.force - self.load)
+        q = self.q
+        if m.q[3:7] @ q[3:7] < 0:
+            q[3:7] *= -1
+        q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
+        q[3:7] /= math.sqrt(q[3:7] @ q[3:7])
+
+    def row(self, surface: str) -> int:
+        """Of a surface in the forces."""
+        return self.surfaces.index(surface)
+
+    def force(self, c: Contact) -> float:
+        """Normal force on a contact's surface [N]."""
+        n = self.world.supports[c.support].normal
+        return float(self.load[self.row(c.surface)] @ n)
+
+    def point(self, c: Contact) -> np.ndarray:
+        """(3,) where the surface's lowest point is."""
+        self.kin.update(self.q)
+        n = self.world.supports[c.support].normal
+        return self.kin.contact_point(c.surface, n, c.edge)
+
+    def deviation(self, c: Contact) -> tuple[float, float]:
+        """How far a contact is from its plan, along the normal and sideways [m]."""
+        n = self.world.supports[c.support].normal
+        off = self.point(c) - c.position - self.kin.roll(c.surface, n, c.link)
+        up = float(off @ n)
+        return up, float(np.linalg.norm(off - up * n))
+
+    def touches(self, c: Contact, aside: float = NEAR) -> bool:
+        """Force on the surface, not far from where its contact was planned."""
+        if self.force(c) < TOUCH:
+            return False
+        up, side = self.deviation(c)
+        return side < aside and abs(up) < REACH + 0.02
+
+    def substitute(self, c: Contact) -> Contact | None:
+        """The contact of another surface of the limb that is loaded in place of `c`."""
+        if self.force(c) >= LOST:
+            return None
+        support = self.world.supports[c.support]
+        for surface in self.world.robot.limb_of(c.surface).surfaces:
+            other = replace(c, surface=surface, edge=None, link=None)
+            if surface != c.surface and self.force(other) >= TOUCH:
+                p = self.point(other)
+                there = support.inside(p) and abs(support.height(p)) < REACH
+                if there and self._lies(surface, support.normal):
+                    return replace(other, position=p)
+        return None
+
+    def is_lost(self, c: Contact) -> bool:
+        """Neither the contact's surface nor another one of the limb is loaded."""
+        return self.force(c) < LOST and self.substitute(c) is None
+
+    def _lies(self, surface: str, normal: np.ndarray) -> bool:
+        """Whether a surface lies on a support rather than touching with a corner.
+
+        Only then its middle is where the support is. The kinematics are up to date.
+        """
+        s = self.world.surfaces[surface]
+        if s.rotation is None:
+            return True
+        up = (self.kin.rotation(s.body) @ s.rotation)[:, 2]
+        return float(up @ normal) > math.cos(TILTED)
+
+    def measured(self, c: Contact) -> Contact:
+        """The contact where it is."""
+        self.kin.update(self.q)
+        return felt_contact(self.kin, c)
+
+    def remember(self, contacts: Sequence[Contact], done: int) -> None:
+        """Keep where supports were measured, one place for each contact made.
+
+        Args:
+            contacts: That are loaded now.
+            done: Steps that have been done.
+        """
+        for c in contacts:
+            if c.support != GROUND:
+                p = self.point(c)
+                near = (
+                    k
+                    for k, (_, x) in self._measured.items()
+                    if k[0] == c.surface and np.linalg.norm(x[:2] - p[:2]) < SAME_PLACE
+                )
+                key = next(near, (c.surface, done))
+                self._measured[key] = (c.support, p)
+
+    def scene(self, planned: Scene) -> Scene:
+        """The planned scene as it is by what was measured; its start as believed."""
+        scene = believed_scene(planned, self._measured.values())
+        return replace(scene, start=self.world.scene.start)

@@ -1,0 +1,712 @@
+"""Execution that reacts to its contacts: in physics, and on made-up measurements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from clamber.errors import Status
+from clamber.execution import executive
+from clamber.execution.disturbance import Disturbance
+from clamber.execution.estimate import LOST, TOUCH
+from clamber.execution.events import (
+    ContactMoved,
+    Heavier,
+    Lost,
+    Missing,
+    NotReplanned,
+    Replanned,
+    StartsElsewhere,
+    Stopped,
+    Unintended,
+)
+from clamber.execution.executive import (
+    DEVIATION,
+    FALLBACK,
+    LOOK,
+    MASS_CHANGE,
+    RETREATS,
+    SEARCHES,
+    START_DRIFT,
+    THINKING,
+    Executive,
+    OpenLoop,
+)
+from clamber.execution.sensors import Measurement
+from clamber.execution.servo import JointServo, self_positioning_joints
+from clamber.execution.simulation import has_fallen, simulate
+from clamber.execution.unintended import UnintendedContact
+from clamber.execution.verdict import END_SPEED, Figure, judge
+from clamber.model.kinematics import Kinematics
+from clamber.model.se3 import quat_from_yaw, quat_multiply
+from clamber.model.world import PHYSICS_STEP
+from clamber.planning.adaptation import FEELING_SPEED, REACH
+from clamber.planning.planner import timed
+from clamber.planning.trajectory import HOLD_END, HOLD_START
+from clamber.step.change import Failure
+
+EXACT = {"noise": 0.0, "delay": 0.0}
+TOP = 0.275  # [m] the box that was planned for
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def run(plan, **disturbance):
+    """What physics made of it."""
+    return simulate(plan, disturbance=Disturbance(**disturbance))
+
+
+def kinds(events) -> list[type]:
+    return [type(e) for e in events]
+
+
+def first(rollout, kind):
+    return next(e for e in rollout.events if isinstance(e, kind))
+
+
+def described(contacts) -> list[str]:
+    return sorted(f"{c.surface}@{c.support}" for c in contacts)
+
+
+def point_at(rollout, time: float, surface: str) -> np.ndarray:
+    """(3,) where a ball of the real robot was lowest."""
+    kin = Kinematics(rollout.world)
+    kin.update(rollout.qpos[round(time / rollout.time[1])])
+    return kin.contact_point(surface, UP)
+
+
+def load(rollout, time: float) -> dict[str, float]:
+    row = rollout.contact_force[round(time / rollout.time[1])]
+    return dict(zip(rollout.surfaces, row[:, 2].tolist(), strict=True))
+
+
+def touch_of(plan, change: int) -> int:
+    """The last sample before the contact of a change is closed."""
+    parts = [s for s in plan.trajectory.segments if s.change == change]
+    return next(s.end for s in parts if s.makes is not None) - 1
+
+
+def end_of(plan, change: int) -> int:
+    """The last sample of a change."""
+    return [s.end for s in plan.trajectory.segments if s.change == change][-1] - 1
+
+
+@pytest.fixture(scope="module")
+def still(fast_plan):
+    """The whole climb, nothing disturbed."""
+    return run(fast_plan, **EXACT)
+
+
+@pytest.fixture(scope="module", params=[-0.03, 0.03], ids=["lower", "higher"])
+def other_height(request, hands_plan):
+    return request.param, run(hands_plan, height=request.param, **EXACT)
+
+
+@pytest.fixture(scope="module")
+def climbed(fast_plan):
+    """The whole climb onto a box that is lower than was planned."""
+    return run(fast_plan, height=-0.03, **EXACT)
+
+
+@pytest.fixture(scope="module")
+def gone(hands_plan):
+    """The top is far below where it was planned."""
+    return run(hands_plan, height=-0.2, **EXACT)
+
+
+@pytest.fixture(scope="module")
+def noisy(hands_plan):
+    return run(hands_plan, height=0.02, seed=3)
+
+
+# Nothing disturbed.
+
+
+def test_undisturbed_there_is_nothing_to_report(fast_plan, still):
+    assert still.events == ()
+    assert not still.fell
+    assert judge(fast_plan, still).reached
+    assert sorted(still.rests_on) == described(fast_plan.keyframes[-1].stance)
+
+
+def test_undisturbed_the_plan_itself_is_followed_up_to_the_first_touch(
+    fast_plan, still
+):
+    """Then contacts may be waited for: what is followed is the plan, later."""
+    t, followed, touch = fast_plan.trajectory, still.followed, touch_of(fast_plan, 0)
+    assert np.array_equal(followed.q[: touch - 1], t.q[1:touch])
+    assert np.array_equal(followed.tau[: touch - 1], t.tau[1:touch])
+    late = (len(followed.time) - len(t.time)) * PHYSICS_STEP
+    assert 0 <= late < 6 * 0.5
+    assert np.abs(followed.q[-1] - t.q[-1]).max() < 0.02
+    # When keyframes were reached: each as planned, as late as contacts were waited for.
+    assert len(followed.keyframes) == len(t.keyframes)
+    assert np.all(np.diff(followed.keyframes) > 0)
+    ends = [*t.keyframes[:-1], t.time[-1] - HOLD_END]
+    assert np.all(np.abs(followed.keyframes - ends) < late + 2e-3)
+
+
+def test_two_runs_are_the_same_to_the_last_bit(hands_plan, noisy):
+    """With noise, delay and planning anew on the way."""
+    again = run(hands_plan, height=0.02, seed=3)
+    assert noisy.events == again.events
+    assert Replanned in kinds(noisy.events)
+    for name in ("ctrl", "qpos", "qvel", "contact_load"):
+        assert np.array_equal(getattr(noisy, name), getattr(again, name))
+
+
+# A box that is elsewhere.
+
+
+def test_the_hand_stops_where_it_touches(hands_plan, other_height):
+    height, rollout = other_height
+    event, again = first(rollout, ContactMoved), first(rollout, Replanned)
+    assert event.surface == event.planned == "LHand"
+    assert event.above == pytest.approx(height, abs=4e-3)
+    assert event.aside < 0.015
+    assert again.changes == 1
+    assert again.time - event.time == pytest.approx(LOOK + THINKING, abs=0.01)
+    k, n = round(event.time / PHYSICS_STEP), round((LOOK + THINKING) / PHYSICS_STEP)
+    q = rollout.followed.q[k : k + n]
+    assert np.all(q == q[0])
+    assert not rollout.followed.v[k + 1 : k + n].any()
+    p = point_at(rollout, event.time + 0.1, "LHand")
+    assert p[2] == pytest.approx(TOP + height, abs=2e-3)
+    # It is measured between two recorded states.
+    hand = [load(rollout, event.time + t)["LHand"] for t in (0.0, rollout.time[1])]
+    assert max(hand) > 0.5 * TOUCH
+    # A hand that lands fast may bounce; it stays near, and the reference is still.
+    moved = point_at(rollout, event.time + LOOK + THINKING, "LHand") - p
+    assert np.linalg.norm(moved) < 0.02
+    # Up to there it was the plan that was followed; then it was probed for.
+    t, before = hands_plan.trajectory, min(k, touch_of(hands_plan, 0))
+    assert np.array_equal(rollout.followed.q[: before - 1], t.q[1:before])
+
+
+def test_what_is_left_is_done_on_the_top_as_it_is(hands_plan, other_height):
+    height, rollout = other_height
+    assert rollout.stopped == ""
+    assert sorted(rollout.rests_on) == described(hands_plan.keyframes[-1].stance)
+    end = load(rollout, rollout.time[-1])
+    for hand in ("LHand", "RHand"):
+        there = point_at(rollout, rollout.time[-1], hand)
+        assert there[2] == pytest.approx(TOP + height, abs=2e-3)
+        assert end[hand] > LOST
+
+
+def test_the_whole_climb_ends_on_top_of_a_lower_box(fast_plan, climbed):
+    assert judge(fast_plan, climbed).reached
+    assert kinds(climbed.events[:2]) == [ContactMoved, Replanned]
+    assert climbed.events[1].changes == 5
+    final = fast_plan.keyframes[-1].stance
+    assert sorted(climbed.rests_on) == described(final)
+    for c in final:
+        there = point_at(climbed, climbed.time[-1], c.surface)
+        assert there[2] == pytest.approx(TOP - 0.03, abs=5e-3)
+    planned = fast_plan.trajectory.q[-1, 2]
+    assert climbed.qpos[-1, 2] == pytest.approx(planned - 0.03, abs=0.02)
+
+
+def test_what_was_followed_is_written_down_step_by_step(climbed):
+    """The commands are those of the servo law on what is said to be followed."""
+    t, w = climbed.followed, climbed.world
+    assert len(t.time) == len(climbed.ctrl)
+    assert np.array_equal(t.time, np.arange(len(t.time)) * PHYSICS_STEP)
+    assert len(t.keyframes) == 7
+    assert not t.v[:, :6].any()
+    order = [w.model.actuator(j).id for j in w.joints]
+    stiff = w.ki > 0
+    push = w.kp * (climbed.ctrl[:, order] - t.q[:, w.qadr])
+    damping = w.kd + w.model.dof_damping[w.dadr]
+    rest = push - damping * t.v[:, w.dadr] - t.tau
+    ankles = np.any(list(self_positioning_joints(w).values()), axis=0)
+    # What is left is the integral: bounded, and absent where joints are compliant.
+    assert np.abs(rest[:, stiff & ~ankles]).max() < 5.0 + 1e-6
+    assert np.abs(rest[:, ~stiff]).max() < 1e-6
+    # No jumps, also where one plan takes over from another.
+    joints = t.q[:, w.qadr]
+    assert np.abs(np.diff(joints, axis=0)).max() < 5e-3  # [rad] in 1 ms
+    assert np.abs(np.diff(joints, 2, axis=0)).max() < 5e-3
+
+
+# A box that is not there.
+
+
+def test_where_nothing_is_found_the_robot_stops_and_says_why(hands_plan, gone):
+    """Once it has looked in a few other places, each from the stance that holds."""
+    assert kinds(gone.events) == [Missing, Replanned] * SEARCHES + [Stopped]
+    missing = gone.events[0]
+    assert (missing.surface, missing.depth) == ("LHand", REACH)
+    assert {e.changes for e in gone.events if isinstance(e, Replanned)} == {2}
+    assert gone.stopped == str(missing)
+    assert not judge(hands_plan, gone).criteria[Figure.WENT_ON].ok
+    # It has probed as deep as it may.
+    time = missing.time
+    before = np.arange(time - REACH / FEELING_SPEED - 1.0, time, 0.02)
+    low = min(point_at(gone, t, "LHand")[2] for t in before)
+    assert TOP - REACH - 5e-3 < low < TOP - REACH + 0.01
+    # Another place is looked for from where it began to probe.
+    assert point_at(gone, time, "LHand")[2] == pytest.approx(TOP, abs=0.01)
+
+
+def test_it_stands_stably_in_the_stance_that_it_had(gone):
+    assert sorted(gone.rests_on) == ["LFoot@ground", "RFoot@ground"]
+    assert not gone.fell
+    assert gone.end_speed.max() < END_SPEED
+    end = load(gone, gone.time[-1])
+    weight = 9.81 * gone.world.mass
+    assert end["LFoot"] + end["RFoot"] == pytest.approx(weight, rel=0.01)
+    assert not has_fallen(gone.qpos[-1], gone.followed.q[-1])
+    held = gone.time[-1] - gone.events[-1].time
+    assert held == pytest.approx(HOLD_END, abs=0.02)
+    assert np.abs(gone.qvel[-1]).max() < 0.05
+
+
+# Start, weight, push.
+
+
+def test_a_start_that_is_off_is_measured_and_the_whole_plan_made_anew(hands_plan):
+    rollout = run(hands_plan, x=-0.02, y=0.02, yaw=0.08, **EXACT)
+    event = first(rollout, StartsElsewhere)
+    assert event.time == pytest.approx(HOLD_START, abs=0.01)
+    assert event.distance == pytest.approx(0.028, abs=3e-3)
+    assert event.yaw == pytest.approx(0.08, abs=0.01)
+    assert kinds(rollout.events[:2]) == [StartsElsewhere, Replanned]
+    assert rollout.events[1].changes == 2
+    assert rollout.stopped == ""
+    end = load(rollout, rollout.time[-1])
+    assert min(end["LHand"], end["RHand"]) > LOST
+
+
+def test_torques_follow_the_mass_that_is_measured(hands_plan):
+    rollout = run(hands_plan, mass=1.1, **EXACT)
+    event = first(rollout, Heavier)
+    assert event.time == pytest.approx(HOLD_START, abs=0.01)
+    assert event.factor == pytest.approx(1.1, abs=0.01)
+    assert rollout.stopped == ""
+    # The feed-forward of a compliant joint is all of its torque while it is still.
+    w, t = rollout.world, rollout.followed
+    k = round(event.time / PHYSICS_STEP) + 2
+    j = int(np.flatnonzero((w.ki == 0) & (np.abs(t.tau[k]) > 1.0))[0])
+    u = rollout.ctrl[k, w.model.actuator(w.joints[j]).id]
+    damping = w.kd[j] + w.model.dof_damping[w.dadr[j]]
+    left = w.kp[j] * (u - t.q[k, w.qadr[j]]) - damping * t.v[k, w.dadr[j]]
+    assert left == pytest.approx(event.factor * t.tau[k, j], rel=1e-6)
+
+
+def test_a_push_acts_from_when_it_begins_and_not_before(hands_plan, noisy):
+    pushed = run(hands_plan, height=0.02, seed=3, push=40.0)
+    assert noisy.push is None
+    assert len(pushed.push) == len(pushed.ctrl)
+    start = int(np.flatnonzero(pushed.push.any(axis=1))[0])
+    row = start // 10
+    assert np.array_equal(pushed.qpos[: row + 1], noisy.qpos[: row + 1])
+    off = pushed.qpos[row + 20, :2] - noisy.qpos[row + 20, :2]
+    assert off @ pushed.push[start, :2] / 40.0 > 1e-3
+    assert not pushed.fell
+
+
+def test_a_push_that_fells_the_robot_ends_the_run(hands_plan):
+    rollout = run(hands_plan, push=1000.0, seed=2, **EXACT)
+    assert rollout.fell
+    assert len(rollout.ctrl) < len(hands_plan.trajectory.time)
+    assert rollout.rests_on == ()
+    assert not judge(hands_plan, rollout).criteria[Figure.UPRIGHT].ok
+
+
+# On made-up measurements: all that is looked at.
+
+
+class Told:
+    """A robot of thin air, on scales: it is where it should be, but for what is said.
+
+    What is closed, or soon will be, is loaded alike.
+    """
+
+    def __init__(self, plan, world=None):
+        self.executive = Executive(plan, world or plan.world)
+        self.world, self.surfaces = plan.world, list(plan.world.surfaces)
+        self.trajectory, self.k = plan.trajectory, 0
+
+    def scales(self) -> np.ndarray:
+        """(nS, 3) forces."""
+        t = self.trajectory
+        rows = [min(self.k + n, len(t.time) - 1) for n in (0, 60)]
+        closed = t.contact[rows].any(axis=0)
+        force = np.zeros((len(self.surfaces), 3))
+        force[closed, 2] = 9.81 * self.world.mass / closed.sum()
+        return force
+
+    def tick(self, q=None, force=None) -> np.ndarray:
+        e = self.executive
+        self.k += 1
+        return e.command(
+            Measurement(
+                e.reference.copy() if q is None else q,
+                self.scales() if force is None else force,
+            )
+        )
+
+    def to(self, k: int, up: float = 0.0, **newtons: float) -> None:
+        """Up to a sample of the plan, or the first event after that is begun."""
+        seen = len(self.events)
+        while self.k < k and len(self.events) == seen:
+            q, force = self.executive.reference.copy(), self.scales()
+            q[2] += up
+            for surface, f in newtons.items():
+                force[self.surfaces.index(surface)] = [0.0, 0.0, f]
+            self.tick(q, force)
+
+    def finish(self) -> None:
+        while self.executive.left:
+            self.tick()
+
+    @property
+    def events(self):
+        return self.executive.events
+
+
+@pytest.fixture
+def nothing_found(monkeypatch):
+    """Planning again finds no way; what it was asked for is in this list."""
+    asked = []
+
+    def adapt(plan, scene, now, commanded, clearance):
+        asked.append(now)
+        failure = Failure(status=Status.UNREACHABLE, detail="no way")
+        return replace(
+            plan, changes=(), failures=(failure,), trajectory=None, complete=False
+        )
+
+    monkeypatch.setattr(executive, "adapt_plan", adapt)
+    monkeypatch.setattr(
+        executive, "start_again", lambda plan, scene: adapt(plan, scene, None, 0, 0)
+    )
+    return asked
+
+
+def test_without_looking_at_physics_it_follows_what_it_is_told(hands_plan):
+    """A robot that is always where it should be, on scales that agree."""
+    told = Told(hands_plan)
+    told.finish()
+    assert told.events == []
+    assert told.executive.done == 2
+    assert told.executive.followed is None
+    assert sorted(told.executive.rests_on) == described(hands_plan.keyframes[-1].stance)
+
+
+@pytest.mark.parametrize(
+    ("forward", "turn", "noticed"),
+    [
+        (0.9 * START_DRIFT, 0.0, False),
+        (1.1 * START_DRIFT, 0.0, True),
+        (0.0, 0.02, False),
+        (0.0, -0.06, True),  # by what it does to the arms
+    ],
+)
+def test_a_start_that_is_hardly_off_is_left_alone(
+    hands_plan, nothing_found, forward, turn, noticed
+):
+    told = Told(hands_plan)
+    q = hands_plan.trajectory.q[0].copy()
+    c, s = np.cos(turn), np.sin(turn)
+    at = hands_plan.world.scene.start[:2]  # turned about the ankles
+    q[:2] = at + np.array([[c, -s], [s, c]]) @ (q[:2] - at) + [forward, 0.0]
+    q[3:7] = quat_multiply(quat_from_yaw(turn), q[3:7])
+    for _ in range(round(HOLD_START / PHYSICS_STEP) + 1):
+        told.tick(q)
+    assert kinds(told.events) == [StartsElsewhere] * noticed
+    if noticed:
+        assert told.events[0].distance == pytest.approx(forward, abs=1e-4)
+        assert told.events[0].yaw == pytest.approx(turn, abs=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_weight_within_what_sensors_tell_is_taken_for_the_description(
+    hands_plan, share
+):
+    told, ratio = Told(hands_plan), 1.0 + share * MASS_CHANGE
+    for _ in range(310):
+        told.tick(force=ratio * told.scales())
+    assert kinds(told.events) == [Heavier] * (share > 1)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_where_no_other_plan_is_found_the_one_at_hand_may_do(
+    hands_plan, nothing_found, share
+):
+    """As far as contacts are not too far off; else it stays where it is."""
+    told, touch = Told(hands_plan), touch_of(hands_plan, 0)
+    told.to(touch - 40)
+    told.to(touch, up=share * FALLBACK, LHand=50.0)
+    assert kinds(told.events) == [ContactMoved]
+    assert told.events[0].made
+    q = told.executive.reference.copy()
+    while len(told.events) == 1:
+        told.tick(force=told.scales())
+    assert np.array_equal(told.executive.reference[7:], q[7:]) or share < 1
+    assert kinds(told.events[1:]) == [NotReplanned if share < 1 else Stopped]
+    assert told.executive.stopped == ("" if share < 1 else "no way")
+    (now,) = nothing_found
+    assert {c.surface for c in now.stance} == {"LFoot", "RFoot", "LHand"}
+    assert {c.surface for c in now.loaded} == {"LFoot", "RFoot"}
+    assert now.done == told.executive.done == 1
+
+
+def test_with_all_steps_done_there_is_no_need_of_another_plan(
+    hands_plan, nothing_found
+):
+    told, touch = Told(hands_plan), touch_of(hands_plan, 1)
+    told.to(touch - 40)
+    told.to(touch, up=3.0 * FALLBACK, RHand=50.0)
+    assert kinds(told.events) == [ContactMoved]
+    told.finish()
+    assert kinds(told.events) == [ContactMoved, NotReplanned]
+    assert told.events[1].stays
+    assert told.executive.stopped == ""
+
+
+def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
+    hands_plan, monkeypatch
+):
+    """And its end is said when it is reached; one without a change is no plan."""
+    failure = Failure(status=Status.UNREACHABLE, detail="no way")
+    for n, said in ((1, [Replanned, Stopped]), (0, [Stopped])):
+        changes = hands_plan.changes[1 : 1 + n]
+        found = replace(
+            hands_plan,
+            start=hands_plan.keyframes[1],
+            changes=changes,
+            failures=(failure,),
+            complete=False,
+            trajectory=timed(hands_plan.world, changes or hands_plan.changes, "max"),
+        )
+        monkeypatch.setattr(executive, "adapt_plan", lambda *_, found=found: found)
+        told, touch = Told(hands_plan), touch_of(hands_plan, 0)
+        told.to(touch - 40)
+        told.to(touch, up=1.1 * FALLBACK, LHand=50.0)
+        while len(told.events) == 1:
+            told.tick()
+        if n:  # what it stands on from there on
+            told.trajectory, told.k = found.trajectory, 299
+        told.finish()
+        assert kinds(told.events[1:]) == said
+        assert told.executive.stopped == "no way"
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_a_contact_that_carries_nothing_is_probed_for_again(fast_plan, found):
+    """The left hand is told that it carries nothing once both hands are down."""
+    told, kin = Told(fast_plan), Kinematics(fast_plan.world)
+    hand, top = told.surfaces.index("LHand"), fast_plan.world.supports["box"]
+    touch, end = touch_of(fast_plan, 1), end_of(fast_plan, 1)
+    low = 0.0  # how far below the top the hand has been
+    while told.k < end + 3000 and len(told.events) < 2:
+        kin.update(told.executive.reference)
+        below = -float(top.height(kin.contact_point("LHand", UP)))
+        force = told.scales()
+        if told.k > touch + 50:
+            there = found and below > 0.5 * DEVIATION
+            force[hand] = [0.0, 0.0, 30.0] if there else 0.0
+            low = max(low, below)
+        told.tick(force=force)
+        if found and told.events and told.executive.done > 2:
+            break
+    assert kinds(told.events) == ([Lost] if found else [Lost, Lost])
+    assert {e.surface for e in told.events} == {"LHand"}
+    assert [e.given_up for e in told.events] == [False, True][: len(told.events)]
+    # Found a little lower, the plan goes on; else it was probed as deep as may be.
+    assert low == pytest.approx(0.5 * DEVIATION if found else REACH, abs=2e-3)
+    assert told.executive.stopped == ""
+    if found:
+        return
+    # The hand is no part of the stance any more, nor of what is believed of the box.
+    while len(told.events) == 2:
+        force = told.scales()
+        force[hand] = 0.0
+        told.tick(force=force)
+    assert kinds(told.events[2:]) in ([Replanned], [Stopped])
+    if told.executive.stopped == "":
+        assert "LHand" not in {c.surface for c in told.executive.stance}
+    believed = told.executive.estimate.scene(fast_plan.world.scene).boxes[0].top
+    assert abs(float(top.height(believed.position))) < 3e-3
+    assert float(top.normal @ believed.normal) > np.cos(0.02)
+
+
+def test_all_surfaces_that_are_loaded_at_the_end_are_rested_on(fast_plan):
+    """Hand and elbow of a limb may both be down, where one of them was planned."""
+    told, hold = Told(fast_plan), fast_plan.trajectory.segments[-1]
+    told.to(hold.begin)
+    while told.executive.left:
+        force = told.scales()
+        for surface, f in {"LHand": 1.1, "RHand": 0.9}.items():
+            force[told.surfaces.index(surface), 2] = f * LOST
+        told.tick(force=force)
+    planned = ["LElbow@box", "LKnee@box", "RElbow@box", "RKnee@box"]
+    assert sorted(told.executive.rests_on) == sorted(["LHand@box", *planned])
+
+
+def test_ankles_position_themselves_while_both_arms_are_loaded(demo_plan):
+    """Then their command is the measured angle and the feed-forward, nothing else."""
+    told, w = Told(demo_plan), demo_plan.world
+    feet = self_positioning_joints(w)
+    lifts = int(
+        np.flatnonzero(~told.trajectory.contact[:, told.surfaces.index("LFoot")])[0]
+    )
+    off, free = np.zeros(len(w.joints)), {}
+    off[np.any(list(feet.values()), axis=0)] = 0.01
+    for k in range(lifts):
+        q = told.executive.reference.copy()
+        q[w.qadr] += off
+        u = told.tick(q)
+        tau = told.trajectory.tau[told.k] / w.kp
+        free[k] = {f: np.abs(u - q[w.qadr] - tau)[j].max() for f, j in feet.items()}
+    both_down, held = touch_of(demo_plan, 1) + 700, lifts - 300
+    assert max(max(free[k].values()) for k in range(both_down, lifts - 1100)) < 2e-3
+    assert min(min(free[k].values()) for k in range(100, touch_of(demo_plan, 1))) > 5e-3
+    assert min(free[k]["LFoot"] for k in range(held, lifts)) > 5e-3  # before it steps
+    assert max(free[k]["RFoot"] for k in range(held, lifts)) < 2e-3
+
+
+# Unintended contacts.
+
+
+@pytest.fixture
+def arm_on_box(demo_plan, monkeypatch):
+    """What seems to carry the load that is missing: this link of the robot."""
+    geom = {"name": "RUpperArm"}
+    m = demo_plan.world.model
+
+    def loaded_link(kin, load, weight):
+        return UnintendedContact(m.geom(geom["name"]).id, "box", 0.01)
+
+    monkeypatch.setattr(executive, "loaded_link", loaded_link)
+    return geom
+
+
+def lighter(told, k: int, share: float = 0.8) -> None:
+    """The surfaces carry less than the weight, up to a sample or the next event."""
+    seen = len(told.events)
+    while told.k < k and len(told.events) == seen:
+        told.tick(force=share * told.scales())
+
+
+@pytest.mark.parametrize("side", ["L", "R"])
+def test_a_limb_on_its_way_may_graze_an_edge(
+    demo_plan, nothing_found, arm_on_box, side
+):
+    """The others are kept farther away from what they touch."""
+    assert demo_plan.changes[0].step.makes.surface == "LHand"
+    arm_on_box["name"] = f"{side}UpperArm"
+    told = Told(demo_plan)
+    told.to(2000)
+    lighter(told, 3000)
+    assert kinds(told.events) == [Unintended] * (side == "R")
+    if side == "R":
+        assert told.events[0].support == "box"
+        assert list(told.executive.clearance.values()) == [pytest.approx(0.03)]
+
+
+def test_on_the_way_to_where_a_change_begins_an_unintended_contact_may_end(
+    demo_plan, nothing_found, arm_on_box
+):
+    """There a new plan lifts off what touched; back would be where it did."""
+    t = demo_plan.trajectory
+    later = replace(t, keyframes=np.array([0.8, *t.keyframes[1:]]))
+    told = Told(replace(demo_plan, trajectory=later))
+    told.to(301)
+    lighter(told, 800)
+    assert told.events == []
+    lighter(told, 900)
+    assert kinds(told.events) == [Unintended]
+
+
+def test_an_unintended_contact_is_lifted_before_contacts_are_called_lost(
+    demo_plan, nothing_found, arm_on_box
+):
+    told, end = Told(demo_plan), end_of(demo_plan, 0)
+    told.to(end - 100)
+    while not told.events:
+        told.tick(force=np.zeros((len(told.surfaces), 3)))
+    assert kinds(told.events) == [Unintended]
+
+
+def test_while_a_contact_is_loaded_it_goes_back_to_its_touch(
+    demo_plan, nothing_found, arm_on_box
+):
+    """The contact is made, and carries nothing as yet."""
+    told, touch = Told(demo_plan), touch_of(demo_plan, 0)
+    told.to(touch + 150)
+    lighter(told, touch + 900)
+    assert kinds(told.events) == [Unintended]
+    while not nothing_found:
+        told.tick()
+    (now,) = nothing_found
+    assert np.array_equal(told.executive.reference, demo_plan.trajectory.q[touch])
+    both = {"LFoot", "RFoot", "LHand"}
+    assert {c.surface for c in now.stance} == both
+    assert {c.surface for c in now.loaded} == both - {"LHand"}
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_where_there_is_no_way_without_it_it_is_accepted(
+    demo_plan, monkeypatch, arm_on_box, nothing_found, found
+):
+    """Back and forth on the plan at hand would end nothing."""
+    if found:
+        monkeypatch.setattr(executive, "adapt_plan", lambda plan, *_: plan)
+    told = Told(demo_plan)
+    told.to(500)
+    for _ in range(8 * 2500):
+        told.k = 500
+        told.tick(force=0.8 * told.scales())
+        if told.executive.stopped:
+            break
+    times = kinds(told.events).count(Unintended)
+    assert times == (RETREATS if found else 1)
+
+
+@pytest.mark.parametrize(
+    ("surface", "hits"), [("LHand", False), ("LElbow", False), ("LKnee", True)]
+)
+def test_what_is_loaded_in_place_of_a_contact_hits_no_side(
+    demo_plan, monkeypatch, surface, hits
+):
+    """A hand in the stance, or the elbow that has come to lie there instead."""
+    asked = []
+    monkeypatch.setattr(executive, "nearest_of", lambda kin, names: asked.append(names))
+    told, end = Told(demo_plan), end_of(demo_plan, 0)
+    told.to(end)
+    kin, top = Kinematics(demo_plan.world), demo_plan.world.supports["box"]
+    row = told.surfaces.index
+    for _ in range(400):
+        q, force = told.executive.reference.copy(), told.scales()
+        if surface == "LElbow":
+            kin.update(q)
+            q[2] -= top.height(kin.contact_point("LElbow", UP))
+            force[row("LHand")] = 0.0
+        force[row(surface)] = [2.0 * TOUCH, 0.0, 1.5 * TOUCH * (surface != "LKnee")]
+        force[row("LFoot"), 2] += 60.0  # nothing is missing
+        told.tick(q, force)
+    assert [*asked[:1]] == ([["LKnee"]] if hits else [])
+
+
+# Open loop.
+
+
+def test_open_loop_the_trajectory_is_followed_sample_by_sample(demo_plan, rng):
+    world, t = demo_plan.world, demo_plan.trajectory
+    follower, servo = OpenLoop(demo_plan, world), JointServo(world)
+    force = np.full((len(world.surfaces), 3), 500.0)  # at which it does not look
+    for k in range(300):
+        q = t.q[k] + rng.normal(0.0, 1e-3, len(t.q[k]))
+        expected = servo.command(
+            t.q[k, world.qadr], t.v[k, world.dadr], t.tau[k], q[world.qadr]
+        )
+        assert np.array_equal(follower.command(Measurement(q, force)), expected)
+        assert follower.left == len(t.time) - 1 - k
+        assert np.array_equal(follower.reference, t.q[k])
+    assert follower.events == []
+    assert follower.followed is None
+    assert sorted(follower.rests_on) == described(demo_plan.keyframes[-1].stance)
