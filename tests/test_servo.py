@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
-from clamber.execution.servo import INTEGRAL_LIMIT, JointServo, driven_world
+from clamber.execution.servo import (
+    EASING,
+    INTEGRAL_LIMIT,
+    JointServo,
+    SelfPositioning,
+    driven_world,
+    self_positioning_joints,
+)
 from clamber.model.world import PHYSICS_STEP
 
 
@@ -105,8 +114,6 @@ def test_without_error_the_command_is_reference_and_feed_forward(demo_plan, pid)
 
 def test_the_integral_holds_what_feed_forward_does_not_know(demo_plan):
     """A constant load on each joint: after a while no error is left."""
-    from dataclasses import replace
-
     world = demo_plan.world
     trajectory = replace(
         demo_plan.trajectory,
@@ -159,8 +166,6 @@ def test_pid_runs_the_planned_world_itself(demo_plan):
 
 
 def test_a_robot_without_impedance_is_driven_as_it_is(demo_plan):
-    from dataclasses import replace
-
     world = demo_plan.world
     stiff = replace(world, robot=replace(world.robot, impedance={}))
     assert driven_world(stiff, "mixed") is stiff
@@ -189,3 +194,47 @@ def test_a_joint_that_positions_itself_is_left_its_feed_forward(demo_plan):
     # The error of that time does not come back when the joint is held again.
     u = law.command(q, np.zeros(n), tau, q)
     assert world.kp[3] * (u[3] - q[3]) == pytest.approx(2.0)
+
+
+# Joints that position themselves: which, and when.
+
+
+def test_ankles_are_those_of_each_foot(demo_plan):
+    world = demo_plan.world
+    found = {
+        foot: {n for n, own in zip(world.joints, joints, strict=True) if own}
+        for foot, joints in self_positioning_joints(world).items()
+    }
+    assert found == {"LFoot": {"LAnkLat", "LAnkSag"}, "RFoot": {"RAnkLat", "RAnkSag"}}
+    plain = replace(world, robot=replace(world.robot, self_positioning=()))
+    assert self_positioning_joints(plain) == {}
+    nothing = np.zeros(len(world.surfaces), dtype=bool)
+    assert SelfPositioning(plain).share(nothing, nothing, nothing) is None
+
+
+def test_ankles_position_themselves_only_while_both_arms_are_loaded(demo_plan):
+    """Eased in and out; before a foot steps its ankle is held, the other goes on."""
+    world = demo_plan.world
+    ankles, feet = SelfPositioning(world), self_positioning_joints(world)
+    free = np.any(list(feet.values()), axis=0)
+    down = np.ones(len(world.surfaces), dtype=bool)
+    n = round(EASING / PHYSICS_STEP)
+
+    def share(*loaded: str, ahead: np.ndarray = down) -> np.ndarray:
+        on = [s in loaded for s in world.surfaces]
+        return ankles.share(on, down, ahead).copy()
+
+    for _ in range(n):
+        assert not share("LHand").any()
+    for k in range(n):
+        now = share("LHand", "RElbow")  # any surface of an arm
+        assert np.allclose(now[free], (k + 1) / n)
+        assert not now[~free].any()
+    assert np.all(share("LElbow", "RElbow")[free] == 1.0)
+    lifts = down.copy()
+    lifts[list(world.surfaces).index("LFoot")] = False
+    for k in range(n):
+        now = share("LElbow", "RElbow", ahead=lifts)
+        assert np.allclose(now[feet["LFoot"]], 1.0 - (k + 1) / n)
+        assert np.all(now[feet["RFoot"]] == 1.0)
+    assert np.allclose(share("RElbow")[feet["RFoot"]], 1.0 - 1.0 / n)

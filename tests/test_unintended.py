@@ -86,14 +86,14 @@ def test_the_arm_that_leans_is_found(kin, demo_plan, weight, side, share, sidewa
     force = share * weight * np.array([sideways, 0.0, 1.0])
     load = loads(kin, demo_plan.keyframes[-1].stance, weight, force, p)
     assert load_is_missing(load, weight)
-    lean = loaded_link(kin, load, weight)
-    assert lean is not None
-    assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
-    assert lean.support == "box"
+    found = loaded_link(kin, load, weight)
+    assert found is not None
+    assert kin.world.model.geom(found.geom).name == f"{side}UpperArm"
+    assert found.support == "box"
     near = kin.proximity(SEARCHED)
-    pair = {lean.geom, kin.world.support_geom["box"]}
+    pair = {found.geom, kin.world.support_geom["box"]}
     (k,) = [k for k, i in enumerate(near.pairs) if set(kin.world.pairs[i]) == pair]
-    assert lean.distance == pytest.approx(near.distance[k])
+    assert found.distance == pytest.approx(near.distance[k])
 
 
 def test_it_is_found_through_the_noise_of_the_forces(kin, demo_plan, weight, rng):
@@ -104,9 +104,9 @@ def test_it_is_found_through_the_noise_of_the_forces(kin, demo_plan, weight, rng
         for _ in range(50):
             noisy = load * (1.0 + rng.normal(0.0, 0.02, (len(load), 1)))
             noisy += rng.normal(0.0, 1.0, load.shape)  # what the smoothing leaves
-            lean = loaded_link(kin, noisy, weight)
-            assert lean is not None
-            assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
+            found = loaded_link(kin, noisy, weight)
+            assert found is not None
+            assert kin.world.model.geom(found.geom).name == f"{side}UpperArm"
 
 
 @pytest.mark.parametrize("side", ["L", "R"])
@@ -124,9 +124,9 @@ def test_it_is_found_wherever_soles_are_borne(demo_plan, weight, side, end):
     }
     p = lowest(kin, f"{side}UpperArm")
     load = loads(kin, key.stance, weight, 0.2 * weight * UP, p, borne)
-    lean = loaded_link(kin, load, weight)
-    assert lean is not None
-    assert kin.world.model.geom(lean.geom).name == f"{side}UpperArm"
+    found = loaded_link(kin, load, weight)
+    assert found is not None
+    assert kin.world.model.geom(found.geom).name == f"{side}UpperArm"
 
 
 def test_where_no_part_is_near_the_force_nothing_is_found(kin, demo_plan, weight):
@@ -153,8 +153,8 @@ def test_a_surface_is_never_what_leans(kin, demo_plan, weight):
     for c in stance:
         p = kin.contact_point(c.surface, UP)
         load = loads(kin, stance, weight, 0.2 * weight * UP, p)
-        lean = loaded_link(kin, load, weight)
-        assert lean is None or lean.geom not in own
+        found = loaded_link(kin, load, weight)
+        assert found is None or found.geom not in own
 
 
 @pytest.mark.parametrize(("share", "leans"), [(0.9, False), (1.1, True)])
@@ -179,8 +179,8 @@ def test_a_surface_that_is_loaded_hits_no_side():
 
 def test_what_hits_a_side_is_the_geom_nearest_to_a_support(kin):
     world = kin.world
-    lean = nearest_of(kin, ["LHand", "LElbow"])
-    assert lean is not None
+    found = nearest_of(kin, ["LHand", "LElbow"])
+    assert found is not None
     near = kin.proximity(SEARCHED)
     own = set(world.surfaces["LHand"].geoms) | set(world.surfaces["LElbow"].geoms)
     box = world.support_geom["box"]
@@ -190,9 +190,9 @@ def test_what_hits_a_side_is_the_geom_nearest_to_a_support(kin):
         for g in world.pairs[i]
         if g in own and box in world.pairs[i]
     }
-    assert lean.geom == min(gaps, key=lambda g: gaps[g])
-    assert lean.distance == pytest.approx(min(gaps.values()))
-    assert lean.support == "box"
+    assert found.geom == min(gaps, key=lambda g: gaps[g])
+    assert found.distance == pytest.approx(min(gaps.values()))
+    assert found.support == "box"
 
 
 @pytest.mark.slow
