@@ -64,7 +64,6 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	$(BIN)/clamber learn crossing --out build/policy/policy.json
 	cp build/policy/policy.png docs/policy.png
 	cp build/policy/policy-pelvis.png docs/policy-pelvis.png
-	$(BIN)/python -c 'from clamber.show.plots import cost_shapes; cost_shapes("docs/cost-shapes.png")'
 	$(BIN)/python docs/tools/pictures.py docs/stages
 
 experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)

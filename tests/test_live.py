@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import socket
 import subprocess
@@ -91,17 +90,6 @@ def test_a_surface_that_is_off_makes_no_contact(one_hand_plan: Plan):
     sequence = edits.edited_sequence(one_hand_plan, off)
     assert not any("LHand" in s.surfaces for s in sequence.stances)
     assert not edits.plan_edited(one_hand_plan, off).complete
-
-
-@pytest.mark.parametrize("x", [-9.0, 0.5, 9.0])
-@pytest.mark.parametrize("y", [-9.0, 0.1, 9.0])
-def test_a_contact_stays_on_its_support(x: float, y: float):
-    top = Scene.from_height(0.25).supports[1]
-    point = edits.clamped(top, np.array([x, y, 3.0]))
-    assert abs(top.height(point)) < 1e-12
-    assert top.inside(point, 0.0)
-    if x == 0.5 and y == 0.1:
-        np.testing.assert_allclose(point[:2], [x, y])
 
 
 def test_saving_writes_a_run_of_its_own_and_overwrites_nothing(
@@ -207,22 +195,14 @@ def test_an_empty_folder_is_one_sentence(
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    "name", ["plan.json", "scene.xml", "trajectory.npz", "rollout.npz", "verdict.json"]
-)
-@pytest.mark.parametrize("how", ["cut", "foreign"])
+@pytest.mark.parametrize("name", ["plan.json", "planned.xml", "rollout.npz"])
 def test_what_is_broken_is_named_and_the_rest_is_served(
-    name: str, how: str, whole: Path, tmp_path: Path
+    name: str, whole: Path, tmp_path: Path
 ):
     pytest.importorskip("viser")
     run = Path(shutil.copytree(whole, tmp_path / "run"))
     file = run / name
-    if how == "cut":
-        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    elif name.endswith(".npz"):
-        np.savez(file, time=np.zeros(3))
-    else:
-        file.write_text(json.dumps({"hello": "world"}))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     page = open_view(run, port=18080)
     page.close()
     assert any(m.startswith(name) for m in page.missing), page.missing

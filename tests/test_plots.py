@@ -125,21 +125,3 @@ def test_the_demonstration_is_drawn_with_what_was_found(tmp_path: Path):
     height, width, _ = a.shape
     assert changed[:, 0].max() < height / 2  # the left arm is the first panel
     assert changed[:, 1].max() < width / 2
-
-
-def test_the_weighted_norm_is_five_times_the_norm(tmp_path: Path):
-    picture = pixels(plots.cost_shapes(tmp_path / "cost.png"))
-
-    def top(colour: tuple[int, int, int]) -> int:
-        """Highest pixel of a curve, its legend at the top centre left out."""
-        found = np.all(np.abs(picture - colour) < 30, axis=2)
-        found[:, picture.shape[1] // 4 : -picture.shape[1] // 4] = False
-        return int(np.argwhere(found)[:, 0].min())
-
-    def bottom() -> int:
-        found = np.all(np.abs(picture - (0x1D, 0x4E, 0xD8)) < 30, axis=2)
-        return int(np.argwhere(found)[:, 0].max())
-
-    low = bottom()
-    ratio = (low - top((0x1D, 0x4E, 0xD8))) / (low - top((0xB9, 0x1C, 0x1C)))
-    assert ratio == pytest.approx(5.0, rel=0.06)

@@ -239,24 +239,27 @@ def test_a_fall_and_a_stop_and_what_was_felt_are_told(
 # Broken folders.
 
 
-@pytest.mark.parametrize(
-    ("name", "kept"),
-    [
-        ("plan.json", {"criteria"}),
-        ("planned.xml", {"criteria", "keyframes"}),
-        ("planned.npz", {"criteria", "keyframes", "motion"}),
-        ("scene.xml", {"criteria", "keyframes", "motion"}),
-        ("trajectory.npz", {"criteria", "keyframes", "motion"}),
-        ("rollout.npz", {"criteria", "keyframes", "motion"}),
-        ("execution.json", {"criteria", "keyframes", "motion"}),
-        ("verdict.json", {"keyframes", "motion"}),
-        ("timings.json", {"criteria", "keyframes", "motion"}),
-    ],
-)
-@pytest.mark.parametrize("how", ["gone", "cut", "foreign"])
-def test_what_is_broken_is_named_and_the_rest_is_shown(
-    run: Path, name: str, kept: set[str], how: str
-):
+ALL = {"criteria", "keyframes", "motion"}
+KEPT = {
+    "plan.json": {"criteria"},
+    "planned.xml": {"criteria", "keyframes"},
+    "planned.npz": ALL,
+    "scene.xml": ALL,
+    "trajectory.npz": ALL,
+    "rollout.npz": ALL,
+    "execution.json": ALL,
+    "verdict.json": {"keyframes", "motion"},
+    "timings.json": ALL,
+}
+BROKEN = [
+    *((name, "cut") for name in KEPT),
+    *((name, "gone") for name in ("plan.json", "planned.xml", "rollout.npz")),
+    *((name, "foreign") for name in ("plan.json", "planned.npz", "rollout.npz")),
+]
+
+
+@pytest.mark.parametrize(("name", "how"), BROKEN)
+def test_what_is_broken_is_named_and_the_rest_is_shown(run: Path, name: str, how: str):
     file = run / name
     if how == "gone":
         file.unlink()
@@ -274,7 +277,7 @@ def test_what_is_broken_is_named_and_the_rest_is_shown(
         assert all("writes it" in m for m in said if name != "timings.json"), said
     assert all("\n" not in m for m in record["missing"])
     shown = {k for k in ("criteria", "keyframes", "motion") if record[k]}
-    assert shown == kept
+    assert shown == KEPT[name]
     assert len(report.page([record])) > 10_000
 
 

@@ -21,6 +21,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.show.pictures import mark_keyframe
 from clamber.show.plots import finish_axes, save_plot
 from clamber.show.renderer import Camera, view_of
+from clamber.step.posture import STABILITY_WEIGHT
 from clamber.step.statics import support_ellipse, support_polygon
 
 mpl.rcParams.update({"font.size": 9, "axes.titlesize": 9, "savefig.dpi": 110})
@@ -31,6 +32,30 @@ BONES = (
     *(("Shoulder", "Elbow"), ("Elbow", "Hand"), ("Hip", "Knee"), ("Knee", "Foot")),
     ("Foot", "Foot.toe"),
 )
+
+
+def cost_shapes() -> Figure:
+    """Cost of one contact along x: the norm, and weighted with w = 5 (4.25)."""
+    x = np.linspace(-0.5, 0.5, 401)
+    fig = Figure(figsize=(6, 3.6), layout="constrained")
+    ax = fig.subplots()
+    ax.plot(
+        x, STABILITY_WEIGHT * np.abs(x), color="#1d4ed8", label="weighted norm, w = 5"
+    )
+    ax.plot(x, np.abs(x), color="#b91c1c", label="norm")
+    ax.plot(
+        x,
+        STABILITY_WEIGHT * x**2,
+        color="0.4",
+        ls="--",
+        lw=1,
+        label="w times its square",
+    )
+    ax.set_xlabel("contact against the projection of its supported mass, x [m]")
+    ax.set_ylabel("cost")
+    finish_axes(ax)
+    ax.legend(fontsize=8, frameon=False, loc="upper center")
+    return fig
 
 
 def detection(demo, sequence) -> Figure:
@@ -326,6 +351,7 @@ def main(folder: Path) -> None:
     }
     for name, draw in figures.items():
         save_plot(draw(), folder / f"{name}.png")
+    save_plot(cost_shapes(), folder.parent / "cost-shapes.png")
     keyframe(plan, 2, folder / "equilibrium.png")
     keyframe(plan, 5, folder / "posture.png")
 

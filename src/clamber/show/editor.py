@@ -16,9 +16,9 @@ from clamber.execution.verdict import Verdict, judge
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning.records import Plan
 from clamber.show.edits import (
+    INSET,
     Edits,
     Interval,
-    clamped,
     intervals_of,
     plan_edited,
     save_edited,
@@ -112,7 +112,7 @@ class Editor:
             return
         index, interval = chosen
         support = self._plan.world.supports[interval.contact.support]
-        place = clamped(support, np.array(self._gizmo.position))
+        place = support.nearest(np.array(self._gizmo.position), INSET)
         self._edits = replace(self._edits, moved={**self._edits.moved, index: place})
         if event.phase == "end":
             self._gizmo.position = place

@@ -17,7 +17,6 @@ from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.steps import same_place
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
-from clamber.model.scene import Support
 from clamber.planning.planner import plan
 from clamber.planning.records import Plan
 from clamber.planning.substitutes import without_surfaces
@@ -108,29 +107,6 @@ def intervals_of(made: Plan) -> tuple[Interval, ...]:
     return tuple(sorted(out, key=lambda s: s.first))
 
 
-def clamped(support: Support, point: np.ndarray) -> np.ndarray:
-    """(3,) the point of a support, a little inside its border, that is nearest.
-
-    Args:
-        support: Convex.
-        point: (3,) in the world [m].
-    """
-    local = support.rotation.T @ (point - support.position)
-    vertices = support.polygon
-    inner = vertices * np.maximum(
-        1.0 - INSET / np.maximum(np.linalg.norm(vertices, axis=1, keepdims=True), 1e-9),
-        0.0,
-    )
-    p = local[:2]
-    edges = np.roll(inner, -1, axis=0) - inner
-    across = edges[:, 0] * (p[1] - inner[:, 1]) - edges[:, 1] * (p[0] - inner[:, 0])
-    if np.any(across < 0):  # counter-clockwise: to the right of an edge is outside
-        share = np.sum((p - inner) * edges, axis=1) / np.sum(edges**2, axis=1)
-        near = inner + np.clip(share, 0.0, 1.0)[:, None] * edges
-        p = near[np.argmin(np.linalg.norm(near - p, axis=1))]
-    return support.position + support.rotation[:, :2] @ p
-
-
 def edited_sequence(made: Plan, edits: Edits) -> ContactSequence:
     """The sequence of a plan with the edits in it.
 
@@ -143,7 +119,7 @@ def edited_sequence(made: Plan, edits: Edits) -> ContactSequence:
         interval = intervals[index]
         support = made.world.supports[interval.contact.support]
         contact = replace(
-            interval.contact, position=clamped(support, place), fixed=True
+            interval.contact, position=support.nearest(place, INSET), fixed=True
         )
         for i in range(interval.first, interval.last):
             stances[i] = replace(

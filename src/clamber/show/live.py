@@ -25,7 +25,7 @@ from clamber.show.editor import Editor
 from clamber.show.edits import paired_times
 from clamber.show.page import Page
 from clamber.show.renderer import seen_points
-from clamber.show.sample import Reading, Run, read_run, thinned
+from clamber.show.sample import Run, read_run, thinned
 from clamber.show.scene3d import Figure, Stage
 from clamber.show.skeleton import Skeleton, beside, skeleton_of
 
@@ -92,9 +92,9 @@ def _open_run(
 ) -> Page:
     """The page of a run folder: of its motion, else of its recording, else of words."""
     run = read_run(folder)
-    reading, sequence = Reading(folder, run.missing), None
-    if reading.has(SEQUENCE) or not run.written:
-        sequence = reading.attempt(lambda: load_sequence(folder))
+    sequence = None
+    if run.has(SEQUENCE) or not run.written:
+        sequence = run.attempt(lambda: load_sequence(folder))
     if not (run.written or run.verdict or run.execution or sequence is not None):
         raise InputError(
             f"a run folder with {PLAN} or {SEQUENCE} ({'; '.join(run.missing)})",
@@ -102,10 +102,10 @@ def _open_run(
         )
     named, skeleton = _named_recording(sequence, run) if demo is None else demo, None
     if named is not None:
-        recorded = reading.attempt(lambda: load_demo(named, scene=scene))
+        recorded = run.attempt(lambda: load_demo(named, scene=scene))
         if recorded is not None:
             if sequence is None or sequence.subject is None:
-                sequence = reading.attempt(lambda: detect_contacts(recorded))
+                sequence = run.attempt(lambda: detect_contacts(recorded))
             skeleton = skeleton_of(recorded, sequence)
     notes = (fallback_note(run.written), run.execution.get("stopped", ""))
     page = Page(host, port, folder.resolve().name, run.missing, notes)

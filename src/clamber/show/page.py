@@ -29,7 +29,6 @@ PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")
 SLIDER_STEP = 0.01  # [s]
 STEP = 0.02  # [s] events nearer than this are where one is
-PORTS = 50  # tried, one after the other
 PANEL_WIDTH, ASPECT = 360, 1.2  # [px]; of the picture beside it
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 PLAY, PAUSE, BACK, ON = "play", "pause", "< contact", "contact >"
@@ -102,21 +101,20 @@ class Page:
 
         Args:
             host: To listen on.
-            port: From which on a free one is taken.
+            port: From which on viser takes a free one.
             title: Of the panel.
             missing: A sentence for each thing that cannot be shown.
             notes: What else there is to say.
 
         Raises:
-            InputError: There is no such address, or no free port.
+            InputError: There is no such address.
         """
         import viser
 
         self.host, self.wanted, self.missing = host, port, missing
+        check_address(host, port)
         with _silent():
-            self.server = viser.ViserServer(
-                host=host, port=free_port(host, port), verbose=False
-            )
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.port = self.server.get_port()
         self.clock = Clock(self._tell)
         self._watchers: list[Callable[[float], str]] = []
@@ -275,31 +273,22 @@ class Page:
             last = now
 
 
-def free_port(host: str, port: int) -> int:
-    """The first port from `port` on that nobody listens on.
+def check_address(host: str, port: int) -> None:
+    """Whether this machine can listen there: viser would try on and on.
 
     Raises:
-        InputError: The host is none of this machine, or there is no free port.
+        InputError: It is no port, or the host is none of this machine.
     """
     if not 1 <= port <= 65535:
         raise InputError("a port from 1 to 65535", source="--port", value=port)
     try:
-        family, kind, _, _, address = socket.getaddrinfo(
-            host, 0, type=socket.SOCK_STREAM
-        )[0]
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+        family, kind, _, _, address = found[0]
         with socket.socket(family, kind) as probe:
             probe.bind(address)
     except OSError as e:
         expected = f"an address of this machine ({e.strerror or e})"
         raise InputError(expected, source="--host", value=host) from e
-    for candidate in range(port, min(port + PORTS, 65536)):
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            with contextlib.suppress(OSError):
-                probe.bind((host, candidate))
-                return candidate
-    expected = f"a port that is free, or one of the {PORTS - 1} after it"
-    raise InputError(expected, source="--port", value=port)
 
 
 @contextlib.contextmanager

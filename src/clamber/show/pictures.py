@@ -107,7 +107,7 @@ def draw_scene(
     kin.update(world.home)
     tops = [s for s in scene.supports if s.name != GROUND]
     seen = [robot_corners(kin)]
-    seen += [s.position + s.polygon @ s.rotation[:, :2].T for s in tops]
+    seen += [s.vertices for s in tops]
     yaw, fovy = float(scene.start[2]), float(world.model.vis.global_.fovy)
     view = frame_view(np.concatenate(seen), tile[0] / tile[1], yaw=yaw, fovy=fovy)
     with Camera(world, tile) as camera:

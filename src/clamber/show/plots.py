@@ -23,7 +23,6 @@ from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
 from clamber.run.codec import whole_file
 from clamber.show.sample import Motion
-from clamber.step.posture import STABILITY_WEIGHT
 
 CYCLE_COLOURS = ("#fde68a", "#bfdbfe", "#bbf7d0", "#fecaca", "#e9d5ff")  # in order
 SURFACE_COLOURS = ("#c2410c", "#1d4ed8")  # of a limb's surfaces, the outer one first
@@ -149,30 +148,6 @@ def cost_to_go_plot(plan: Plan, path: str | Path) -> Path:
     ax.set_xlabel("contact change")
     ax.set_ylabel("cost-to-go [m]")
     finish_axes(ax)
-    return save_plot(fig, path)
-
-
-def cost_shapes(path: str | Path) -> Path:
-    """Cost of one contact along x: the norm, and weighted with w = 5 (4.25)."""
-    x = np.linspace(-0.5, 0.5, 401)
-    fig = Figure(figsize=(6, 3.6), layout="constrained")
-    ax = fig.subplots()
-    ax.plot(
-        x, STABILITY_WEIGHT * np.abs(x), color="#1d4ed8", label="weighted norm, w = 5"
-    )
-    ax.plot(x, np.abs(x), color="#b91c1c", label="norm")
-    ax.plot(
-        x,
-        STABILITY_WEIGHT * x**2,
-        color="0.4",
-        ls="--",
-        lw=1,
-        label="w times its square",
-    )
-    ax.set_xlabel("contact against the projection of its supported mass, x [m]")
-    ax.set_ylabel("cost")
-    finish_axes(ax)
-    ax.legend(fontsize=8, frameon=False, loc="upper center")
     return save_plot(fig, path)
 
 

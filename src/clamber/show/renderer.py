@@ -333,16 +333,10 @@ def near_edge_points(scene: Scene) -> np.ndarray:
     if not scene.boxes:
         return np.zeros((0, 3))
     top = scene.boxes[0].top
-    start = np.array([*scene.start[:2], 0.0])
-    A, b = top.edges()
-    facing = int(np.argmax(A @ start - b))
-    corners = top.position + top.polygon @ top.rotation[:, :2].T
-    c, d = corners[facing], corners[(facing + 1) % len(corners)]
-    way = (d - c) / np.linalg.norm(d - c)
-    foot = float(np.clip((start - c) @ way, 0.0, np.linalg.norm(d - c)))
-    span = np.clip([foot - EDGE_SHOWN, foot + EDGE_SHOWN], 0, np.linalg.norm(d - c))
-    edge = c + span[:, None] * way
-    return np.concatenate([edge, edge * [1.0, 1.0, 0.0]])
+    edge = top.edge_towards(scene.start)
+    along = EDGE_SHOWN * np.array([-edge.inward[1], edge.inward[0], 0.0])
+    ends = np.stack([top.nearest(edge.point + way) for way in (-along, along)])
+    return np.concatenate([ends, ends * [1.0, 1.0, 0.0]])
 
 
 def seen_points(kin: Kinematics, q: np.ndarray) -> np.ndarray:

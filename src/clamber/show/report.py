@@ -41,7 +41,6 @@ from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.pictures import FORCE_LENGTH
 from clamber.show.renderer import PRESETS, seen_points
 from clamber.show.sample import (
-    Reading,
     keyframe_times,
     read_run,
     sample_motion,
@@ -159,8 +158,7 @@ def run_record(folder: Path) -> dict[str, Any]:
     """
     run = read_run(folder)
     written, plan, rollout = run.written, run.plan, run.rollout
-    reading = Reading(folder, run.missing)
-    picture = reading.attempt(lambda: _picture(folder / PERSON))
+    picture = run.attempt(lambda: _picture(folder / PERSON))
     if not (written or run.verdict or run.execution or picture):
         raise InputError(
             f"a run folder with a whole {PLAN} or {VERDICT}; {RUN_MAKERS}",

@@ -41,6 +41,7 @@ from clamber.run.folder import (
     load_rollout,
 )
 from clamber.step.posture import Keyframe
+from clamber.step.stability import contact_points
 from clamber.step.statics import (
     Phase,
     com_margin,
@@ -60,12 +61,26 @@ _Loaded = TypeVar("_Loaded")
 # What a folder holds.
 
 
-@dataclass(eq=False, slots=True)
-class Reading:
-    """Reads what can be read of a folder and keeps why the rest could not."""
+@dataclass(eq=False, slots=True, kw_only=True)
+class Run:
+    """What could be read of a run folder, and why the rest could not.
+
+    Attributes:
+        folder: The run folder.
+        missing: A sentence for each thing that could not be read.
+        written, execution, verdict, timings: Fields of the JSON files; empty where they
+            are missing.
+        plan, rollout: None where their files are.
+    """
 
     folder: Path
     missing: list[str] = field(default_factory=list)
+    written: Mapping[str, Any] = field(default_factory=dict)
+    execution: Mapping[str, Any] = field(default_factory=dict)
+    verdict: Mapping[str, Any] = field(default_factory=dict)
+    timings: Mapping[str, Any] = field(default_factory=dict)
+    plan: Plan | None = None
+    rollout: Rollout | None = None
 
     def attempt(self, load: Callable[[], _Loaded]) -> _Loaded | None:
         """What `load` returns; None, and a sentence more, where it cannot."""
@@ -86,29 +101,6 @@ class Reading:
         return (self.folder / name).exists()
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Run:
-    """What could be read of a run folder.
-
-    Attributes:
-        written, execution, verdict, timings: Fields of the JSON files; empty where they
-            are missing.
-        plan, rollout: None where their files are.
-        ran: There is a rollout, whole or not.
-        missing: A sentence for each thing that could not be read.
-    """
-
-    folder: Path
-    written: Mapping[str, Any]
-    plan: Plan | None
-    rollout: Rollout | None
-    execution: Mapping[str, Any]
-    verdict: Mapping[str, Any]
-    timings: Mapping[str, Any]
-    ran: bool
-    missing: list[str]
-
-
 def read_run(folder: Path) -> Run:
     """Read all that can be read of a run folder.
 
@@ -117,44 +109,32 @@ def read_run(folder: Path) -> Run:
     """
     if not folder.is_dir():
         raise InputError(f"a run folder; {RUN_MAKERS}", source=folder)
-    reading = Reading(folder)
-    written = reading.fields(PLAN)
-    ran = reading.has(ROLLOUT)
-    plan, rollout = None, None
-    if written:
-        plan = reading.attempt(lambda: load_plan(folder, without=(TIMINGS,)))
-        if plan is None and reading.has(PLANNED_SCENE):
-            plan = reading.attempt(
-                lambda: load_plan(folder, without=(TIMINGS, PLANNED_TRAJECTORY))
-            )
+    run = Run(folder=folder)
+    run.written, ran = run.fields(PLAN), run.has(ROLLOUT)
+    if run.written:
+        run.plan = run.attempt(lambda: load_plan(folder, without=(TIMINGS,)))
+        if run.plan is None and run.has(PLANNED_SCENE):
+            without = (TIMINGS, PLANNED_TRAJECTORY)
+            run.plan = run.attempt(lambda: load_plan(folder, without=without))
         if ran:
-            rollout = reading.attempt(lambda: load_rollout(folder))
-            if rollout is None and plan is not None:
-                rollout = reading.attempt(
+            run.rollout = run.attempt(lambda: load_rollout(folder))
+            if run.rollout is None and run.plan is not None:
+                run.rollout = run.attempt(
                     lambda: load_rollout(folder, with_events=False)
                 )
     elif ran:
-        reading.missing.append(f"{ROLLOUT} is not shown: that takes a whole {PLAN}")
-    execution = reading.fields(EXECUTION) if ran or reading.has(EXECUTION) else {}
-    verdict = reading.fields(VERDICT) if ran or reading.has(VERDICT) else {}
-    timings = reading.fields(TIMINGS)
-    if written and not ran:
-        if verdict or execution:
+        run.missing.append(f"{ROLLOUT} is not shown: that takes a whole {PLAN}")
+    if ran or run.has(EXECUTION):
+        run.execution = run.fields(EXECUTION)
+    if ran or run.has(VERDICT):
+        run.verdict = run.fields(VERDICT)
+    run.timings = run.fields(TIMINGS)
+    if run.written and not ran:
+        text = "the plan has not been run in physics"
+        if run.verdict or run.execution:
             text = "it has been run in physics; `clamber simulate` writes it anew"
-        else:
-            text = "the plan has not been run in physics"
-        reading.missing.append(f"no {ROLLOUT}: {text}")
-    return Run(
-        folder=folder,
-        written=written,
-        plan=plan,
-        rollout=rollout,
-        execution=execution,
-        verdict=verdict,
-        timings=timings,
-        ran=ran,
-        missing=reading.missing,
-    )
+        run.missing.append(f"no {ROLLOUT}: {text}")
+    return run
 
 
 # Stances.
@@ -264,18 +244,11 @@ def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
     """(3,) [N] of each surface, over all its bearing points; zeros where unknown."""
     kin = Kinematics(world)
     kin.update(key.q)
-    counts = []
-    for c in key.stance:
-        normal = world.supports[c.support].normal
-        counts.append(len(kin.bearing_points(c.surface, normal, c.edge)))
+    names = np.array(contact_points(kin, key.stance).names)
     forces = key.equilibrium.forces
-    if sum(counts) != len(forces):
+    if len(names) != len(forces):
         return {c.surface: np.zeros(3) for c in key.stance}
-    ends = np.cumsum([0, *counts])
-    return {
-        c.surface: forces[a:b].sum(axis=0)
-        for c, (a, b) in zip(key.stance, pairwise(ends), strict=True)
-    }
+    return {c.surface: forces[names == c.surface].sum(axis=0) for c in key.stance}
 
 
 # The motion, sampled.
@@ -348,21 +321,17 @@ class Motion:
             return "sliding"
         return "supporting" if loaded else "reach-to-supportable"
 
-    def swing_after(self, row: int) -> np.ndarray:
-        """(m, 3) way of the surface that makes the next planned contact [m].
 
-        Empty where none comes.
-        """
-        if self.planned is None or self.stills:
-            return np.zeros((0, 3))
-        made = self.planned[1:] & ~self.planned[:-1]
-        later = np.flatnonzero(made[row:].any(axis=1))
-        if not len(later):
-            return np.zeros((0, 3))
-        end = row + int(later[0]) + 1
-        j = int(np.flatnonzero(made[end - 1])[0])
-        earlier = [i for i in range(end) if self.planned[i, j] or made[i - 1].any()]
-        return self.points[earlier[-1] if earlier else 0 : end + 1, j]
+def swings_of(motion: Motion, trajectory: Trajectory) -> list[tuple[float, np.ndarray]]:
+    """When contacts are made [s], and the ways (m, 3) of their surfaces there [m]."""
+    names, time = list(motion.world.surfaces), trajectory.time
+    out = []
+    for s in trajectory.segments:
+        if s.makes is not None:
+            begin, end = float(time[s.begin]), float(time[s.end - 1])
+            rows = (motion.time >= begin) & (motion.time <= end)
+            out.append((end, motion.points[rows, names.index(s.makes.surface)]))
+    return out
 
 
 def sample_motion(
@@ -406,9 +375,8 @@ def sample_motion(
     series |= stability_of(world, q, marked, bears)
     q_ref = series.get("reference")
     if q_ref is not None and planned is not None:
-        series["planned_margin"] = stability_of(world, q_ref, planned, planned)[
-            "margin"
-        ]
+        planned_ones = stability_of(world, q_ref, planned, planned)
+        series["planned_margin"] = planned_ones["margin"]
         series["error"] = _errors(world, q, q_ref)
     end = float(time[-1])
     schedule = [] if reference is None else spells(reference.time, reference.contact)

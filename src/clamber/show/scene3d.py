@@ -29,6 +29,7 @@ from clamber.show.sample import (
     row_at,
     sample_motion,
     support_polygon_at,
+    swings_of,
     thinned,
 )
 from clamber.show.skeleton import Skeleton
@@ -138,6 +139,9 @@ class Stage:
         self.motion = m = sample_motion(plan, rollout, {})
         self.reached = keyframe_times(plan, rollout)
         self.changes = ["start", *(str(c.step) for c in plan.changes)]
+        as_planned = rollout is None or rollout.followed is None
+        trajectory = plan.trajectory if as_planned else None
+        self._swings = [] if trajectory is None else swings_of(m, trajectory)
         self._forces = [force_by_contact(plan.world, k) for k in plan.keyframes]
         self._kin = Kinematics(m.world)
         self._weight = m.world.mass * 9.81
@@ -202,9 +206,9 @@ class Stage:
         self._discs.show(found if layers["contacts"] else [])
         self._show_arrows(row, t, layers["forces"])
         self._show_balance(row, layers["balance"])
-        way = m.swing_after(row) if layers["way of the limb"] else np.zeros((0, 3))
-        self._way.visible = len(way) > 1
-        if len(way) > 1:
+        way = next((w for end, w in self._swings if end > t), ())
+        self._way.visible = layers["way of the limb"] and len(way) > 1
+        if self._way.visible:
             self._way.points = np.stack([way[:-1], way[1:]], axis=1)
         facts = [f"{t:.2f} of {self.duration:.1f} s; {self.change_at(t)}"]
         if math.isfinite(m.margin[row]):
