@@ -189,8 +189,9 @@ def paired_times(
     t = plan.sequence.t
     robot, person = [0.0], [float(t[0])]
     for change, at in zip(plan.changes, reached[1:], strict=True):
-        known = change.step.index is not None and at is not None
-        if known and at > robot[-1]:
+        if change.step.index is None or at is None:
+            continue
+        if at > robot[-1]:
             robot.append(at)
             person.append(float(t[change.step.stance]))
     if end > robot[-1]:

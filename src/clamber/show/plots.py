@@ -102,8 +102,9 @@ def stability_plot(motion: Motion, asked: float, path: str | Path) -> Path:
         path: The file.
     """
     t, margin = motion.time, motion.margin
-    bears = motion.planned if motion.loaded is None else motion.loaded
-    d, limit = (np.where(bears, x, np.nan) for x in (motion.distance, motion.limit))
+    d, limit = (
+        np.where(motion.bears, x, np.nan) for x in (motion.distance, motion.limit)
+    )
     fig = Figure(figsize=(10, 7.2), layout="constrained")
     grid = fig.add_gridspec(3, 2)
     index = {s: i for i, s in enumerate(motion.world.surfaces)}

@@ -306,6 +306,13 @@ class Motion:
     events: list[float]
     felt: list[float]
 
+    @property
+    def bears(self) -> np.ndarray:
+        """(n, nS) bool, what bears load: in physics, else as planned."""
+        found = self.planned if self.loaded is None else self.loaded
+        assert found is not None  # there is one of them
+        return found
+
     def phase(self, row: int, surface: int) -> Phase | None:
         """Of a contact that is planned or bears at a sample; None where there is none.
 
@@ -314,7 +321,7 @@ class Motion:
             surface: Index of the surface.
         """
         planned = self.planned is not None and bool(self.planned[row, surface])
-        loaded = planned if self.loaded is None else bool(self.loaded[row, surface])
+        loaded = bool(self.bears[row, surface])
         if not (planned or loaded):
             return None
         if self.distance[row, surface] > self.limit[row, surface]:
@@ -524,12 +531,11 @@ def support_polygon_at(motion: Motion, kin: Kinematics, row: int) -> np.ndarray:
         kin: At the posture then.
         row: Index of the sample; empty where nothing bears.
     """
-    bears = motion.planned if motion.loaded is None else motion.loaded
     supports = list(motion.world.supports.values())
     points = [
         bearing_of(kin, surface, supports[motion.support[row, j]])
         for j, surface in enumerate(motion.world.surfaces)
-        if bears is not None and bears[row, j]
+        if motion.bears[row, j]
     ]
     if not points:
         return np.zeros((0, 3))
