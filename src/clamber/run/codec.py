@@ -192,10 +192,11 @@ class Codec:
             if len(kinds) != len(inside):
                 raise at.wrong(f"{len(kinds)} values")
             return tuple(map(self.decode, kinds, inside))
-        good = isinstance(x, (int, float) if kind is float else kind)
-        if not good or (isinstance(x, bool) and kind is not bool):
+        if type(x) is int and kind is float:
+            return float(x)
+        if type(x) is not kind:
             raise at.wrong(_PLAIN[kind])
-        return float(x) if kind is float else x
+        return x
 
     def _first(self, kinds: tuple[Any, ...], at: At) -> Any:
         """What the first of several kinds that can makes of it."""
@@ -207,7 +208,7 @@ class Codec:
                 expected.append(e.expected)
         raise at.wrong(" or ".join(expected))
 
-    def _record(self, kind: type, at: At) -> Any:
+    def _record(self, kind: Any, at: At) -> Any:
         form = self._form(kind)
         if form.kinds and kind not in form.kinds:
             return self._record(at.key("type").choice(_by_name(form.kinds)), at)
