@@ -95,17 +95,14 @@ def new_run_folder(out: Path | None, command: str) -> Path:
         InputError: It cannot be made, or nothing can be written into it.
     """
     try:
-        if out is not None:
-            folder = Path(out)
-            folder.mkdir(parents=True, exist_ok=True)
-        else:
-            folder = next_free_folder(Path("runs"), command)
+        folder = Path(out) if out else next_free_folder(Path("runs"), command)
+        folder.mkdir(parents=True, exist_ok=True)
         (folder / ".writable").touch()
         (folder / ".writable").unlink()
     except OSError as e:
-        asked = str(out if out is not None else Path("runs") / command)
+        asked = str(out or Path("runs") / command)
         text = f"a folder that can be written ({e.strerror or e})"
-        raise InputError(text, source="--out", value=asked) from e
+        raise InputError(text, "--out", value=asked) from e
     return folder
 
 
@@ -201,40 +198,30 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
 
 
 def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
-    world = plan.world
-    robot = CODEC.encode(world.robot)
-    hashes = {"robot": _sha256(json.dumps(robot).encode())}
-    for name, path in (
-        ("robot_model", world.robot.path),
-        ("sequence", folder / SEQUENCE),
-    ):
+    kin, robot = Kinematics(plan.world), plan.world.robot
+    fields = CODEC.encode(robot)
+    inputs = {"robot": json.dumps(fields).encode()}
+    for name, path in ("robot_model", robot.path), ("sequence", folder / SEQUENCE):
         if path.is_file():
-            hashes[name] = _sha256(path.read_bytes())
-    kin = Kinematics(world)
+            inputs[name] = path.read_bytes()
     return {
         "versions": {n: importlib.metadata.version(n) for n in VERSIONS_OF},
-        "inputs": hashes,
-        "robot": robot,
-        "prefixes": dict(world.robot.prefixes),
+        "inputs": {n: hashlib.sha256(x).hexdigest() for n, x in inputs.items()},
+        "robot": fields,
+        "prefixes": dict(robot.prefixes),
         **CODEC.object(plan, without=_NOT_IN_PLAN),
         "keyframes": [keyframe_fields(k, kin) for k in plan.keyframes],
         "changes": [CODEC.object(c, without=("keyframe",)) for c in plan.changes],
     }
 
 
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
 def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
     """A keyframe by the keys of `plan.json`, and where its forces act."""
     kin.update(k.q)
     points = contact_points(kin, k.stance)
+    acting = {"surfaces": points.names, "points": points.points}
     out = CODEC.encode(k)
-    out["static_equilibrium"] |= {
-        "surfaces": list(points.names),
-        "points": CODEC.encode(points.points),
-    }
+    out["static_equilibrium"] |= CODEC.encode(acting)
     return out
 
 
@@ -251,7 +238,7 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"a run folder; {RUN_MAKERS}", source=folder)
+        raise InputError(f"a run folder; {RUN_MAKERS}", folder)
     at = _read(folder / PLAN)
     known = _plan_of(at)
     robot = CODEC.decode(Robot, at.key("robot"))
@@ -316,11 +303,11 @@ def trajectory_of(plan: Plan, source: Path) -> Trajectory:
         InputError: It got no motion; `source` is the folder that it came from.
     """
     if plan.trajectory is None:
-        raise InputError(
+        text = (
             "a plan that got as far as a trajectory; the last line of `clamber plan`"
-            " says why this one did not",
-            source=source,
+            " says why this one did not"
         )
+        raise InputError(text, source)
     return plan.trajectory
 
 
@@ -335,22 +322,14 @@ def load_trajectory(path: str | Path, world: World) -> Trajectory:
     Raises:
         InputError: It is missing, broken or another robot's.
     """
-    m = world.model
+    m, na, ns = world.model, len(world.joints), len(world.surfaces)
     f = Arrays(Path(path), maker=_maker(Path(path)))
-    read = CODEC.from_arrays(
-        Trajectory,
-        f,
-        shapes={
-            "time": ("T",),
-            "qpos": ("T", m.nq),
-            "qvel": ("T", m.nv),
-            "tau": ("T", len(world.joints)),
-            "contact": ("T", len(world.surfaces)),
-            "joint_names": (len(world.joints),),
-            "surfaces": (len(world.surfaces),),
-            "keyframes": ("K",),
-        },
-    )
+    shapes = {
+        **{"time": ("T",), "qpos": ("T", m.nq), "qvel": ("T", m.nv)},
+        **{"tau": ("T", na), "contact": ("T", ns), "keyframes": ("K",)},
+        **{"joint_names": (na,), "surfaces": (ns,)},
+    }
+    read = CODEC.from_arrays(Trajectory, f, shapes)
     f.same("joint_names", world.joints)
     f.same("surfaces", tuple(world.surfaces))
     return Trajectory(**read)
@@ -372,11 +351,6 @@ def _copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, draft)
 
 
-def _are_same(a: Path, b: Path) -> bool:
-    """Whether two files hold the same; what is missing does not."""
-    return a.exists() and b.exists() and filecmp.cmp(a, b, shallow=False)
-
-
 # Worlds and robots.
 
 
@@ -392,10 +366,8 @@ def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
         raise unreadable(path, e, _maker(path)) from e
     except (ValueError, KeyError, IndexError) as e:
         reason = " ".join(str(e.args[0] if e.args else e).split())
-        raise InputError(
-            f"the robot and the boxes of {PLAN} as MJCF ({reason}); {_maker(path)}",
-            source=path,
-        ) from e
+        text = f"the robot and the boxes of {PLAN} as MJCF ({reason}); {_maker(path)}"
+        raise InputError(text, path) from e
 
 
 def _save_world(world: World, path: Path) -> None:
@@ -451,26 +423,20 @@ def save_proposal(proposal: Proposal, folder: str | Path) -> None:
 
 def save_replanned(found: Replanned, folder: str | Path) -> None:
     """Write `replan.json`: what was tried, the best first, and what the search did."""
-    e = found.explored
-    write_json(
-        Path(folder) / REPLANNED,
+    plans = [
         {
-            "differences": found.differences,
-            "plans": [
-                {
-                    "surfaces": r.surfaces,
-                    "cost": r.cost,
-                    "stable": r.stable,
-                    "moves": [str(c.step) for c in r.plan.changes],
-                    "missed": [str(f) for f in r.plan.failures],
-                }
-                for r in found.ranked
-            ],
-            "search": None
-            if e is None
-            else {"states": e.states, "tries": e.tries, "stop": e.stop.value},
-        },
-    )
+            "surfaces": r.surfaces,
+            "cost": r.cost,
+            "stable": r.stable,
+            "moves": [str(c.step) for c in r.plan.changes],
+            "missed": [str(f) for f in r.plan.failures],
+        }
+        for r in found.ranked
+    ]
+    e = found.explored
+    search = e and {"states": e.states, "tries": e.tries, "stop": e.stop.value}
+    content = {"differences": found.differences, "plans": plans, "search": search}
+    write_json(Path(folder) / REPLANNED, CODEC.encode(content))
 
 
 # Rollouts and verdicts.
@@ -520,34 +486,20 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     robot = CODEC.decode(Robot, plan.key("robot"))
     world = _load_world(folder / SCENE, robot, CODEC.decode(Scene, scene))
     m, surfaces = world.model, tuple(world.surfaces)
-    states = ("M",)
-    read = CODEC.from_arrays(
-        Rollout,
-        f,
-        shapes={
-            "ctrl": ("N", m.nu),
-            "time": states,
-            "qpos": ("M", m.nq),
-            "qvel": ("M", m.nv),
-            "actuator_force": ("M", m.nu),
-            "contact_force": ("M", len(surfaces), 3),
-            "unintended": states,
-            "surfaces": (len(surfaces),),
-            "penetration": states,
-            "contact_step": ("K",),
-            "contact_geoms": ("K", 2),
-            "contact_load": ("K", 2),
-            "end_speed": ("n",),
-            "push": ("N", 3),
-        },
-        without=_NOT_IN_ROLLOUT,
-    )
+    shapes = {
+        **{"ctrl": ("N", m.nu), "push": ("N", 3), "surfaces": (len(surfaces),)},
+        **{"time": ("M",), "qpos": ("M", m.nq), "qvel": ("M", m.nv)},
+        **{"actuator_force": ("M", m.nu), "contact_force": ("M", len(surfaces), 3)},
+        **{"unintended": ("M",), "penetration": ("M",), "end_speed": ("n",)},
+        **{"contact_step": ("K",), "contact_geoms": ("K", 2), "contact_load": ("K", 2)},
+    }
+    read = CODEC.from_arrays(Rollout, f, shapes, without=_NOT_IN_ROLLOUT)
     f.same("surfaces", surfaces)
-    followed, planned = folder / TRAJECTORY, folder / PLANNED_TRAJECTORY
-    trajectory = None
-    if not _are_same(followed, planned):
-        trajectory = load_trajectory(followed, world)
-    return Rollout(**read, **written, world=world, followed=trajectory)
+    path, planned = folder / TRAJECTORY, folder / PLANNED_TRAJECTORY
+    both = path.exists() and planned.exists()
+    as_planned = both and filecmp.cmp(path, planned, shallow=False)
+    followed = None if as_planned else load_trajectory(path, world)
+    return Rollout(**read, **written, world=world, followed=followed)
 
 
 def _execution_of(at: At) -> dict[str, Any]:
