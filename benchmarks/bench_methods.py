@@ -23,7 +23,7 @@ from clamber.planning.planner import plan
 from clamber.planning.records import Plan, PlanOptions
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
-from clamber.step.change import Method
+from clamber.step.methods import Method
 
 
 def table(result: Plan) -> None:

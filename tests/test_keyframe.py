@@ -15,9 +15,8 @@ from clamber.model.robot import load_robot
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy, quat_from_matrix
 from clamber.model.world import World, build_world
-from clamber.step import direct, gradient, lbfgs
-from clamber.step.alternating import Alternation
 from clamber.step.ik import IK
+from clamber.step.methods import METHODS, Alternation, direct
 from clamber.step.posture import (
     Keyframe,
     KeyframeOptions,
@@ -39,8 +38,7 @@ from clamber.step.stability import (
 from clamber.step.statics import GRAVITY, ContactPoints
 from clamber.step.tasks import EDGE_INSET, Closed, Sliding
 
-METHODS = {"direct": direct, "lbfgs": lbfgs, "gradient": gradient}
-OUTER = {"lbfgs": lbfgs, "gradient": gradient}
+OUTER = {n: m for n, m in METHODS.items() if n != "direct"}
 UP = np.array([0.0, 0.0, 1.0])
 FLAT = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -80,7 +78,7 @@ def results(ik) -> dict[str, Keyframe]:
     """The left hand newly on the box, by each method."""
     task = task_of(ik, on_box("LHand", 0.43, 0.17))
     home, options = ik.world.home, KeyframeOptions()
-    return {n: m.optimise(ik, task, home, options) for n, m in METHODS.items()}
+    return {n: m(ik, task, home, options) for n, m in METHODS.items()}
 
 
 def located(world: World, q: np.ndarray) -> mujoco.MjData:
@@ -248,7 +246,7 @@ def test_both_outer_methods_find_about_the_same_cost(results):
 )
 def test_new_contacts_stay_inside_their_support(ik, name, surface, x, y):
     task = task_of(ik, on_box(surface, x, y))
-    k = METHODS[name].optimise(ik, task, ik.world.home, KeyframeOptions())
+    k = METHODS[name](ik, task, ik.world.home, KeyframeOptions())
     p = k.contacts[-1].contact.position
     assert 0.23 + EDGE_INSET - 1e-4 < p[0] < 1.23
     assert abs(p[1]) < 0.6 - EDGE_INSET + 1e-4
@@ -275,7 +273,7 @@ def askew() -> tuple[IK, KeyframeTask]:
 def test_a_yawed_and_tilted_box_is_climbed_alike(askew, name):
     ik, task = askew
     top = ik.world.supports["box"]
-    k = METHODS[name].optimise(ik, task, ik.world.home, KeyframeOptions())
+    k = METHODS[name](ik, task, ik.world.home, KeyframeOptions())
     assert k.status is Status.SOLVED
     assert k.cost_after < 0.2 * k.cost_before
     found = k.contacts[-1].contact.position
@@ -310,7 +308,7 @@ def test_more_weight_on_stability_brings_the_contact_closer_to_its_mass(ik):
     distances = []
     for weight in (0.05, 1.0, 20.0):
         options = KeyframeOptions(stability_weight=weight)
-        k = direct.optimise(ik, task, ik.world.home, options)
+        k = direct(ik, task, ik.world.home, options)
         assert k.status is Status.SOLVED
         distances.append(k.contacts[-1].projected_distance)
     assert distances[0] > distances[1] > distances[2]
@@ -322,7 +320,7 @@ def test_more_weight_on_the_reference_keeps_the_contact_there(ik):
     for weight in (0.1, 1.5, 20.0):
         options = KeyframeOptions(reference_weight=weight)
         task = task_of(ik, on_box("LHand", *wanted))
-        k = direct.optimise(ik, task, ik.world.home, options)
+        k = direct(ik, task, ik.world.home, options)
         gaps.append(np.linalg.norm(k.contacts[-1].contact.position[:2] - wanted))
     assert gaps[0] > gaps[1] > gaps[2]
 
@@ -332,7 +330,7 @@ def test_a_demonstrated_direction_is_followed(ik):
     lean = np.array([math.sin(0.7), 0.0, math.cos(0.7)])
     angles = []
     for directions in ({}, {"trunk": lean}):
-        k = direct.optimise(
+        k = direct(
             ik,
             replace(task, directions=directions),
             ik.world.home,
@@ -364,7 +362,7 @@ def test_a_demonstrated_direction_is_followed(ik):
 )
 def test_each_rule_stops_by_itself(ik, results, name, options, most):
     task = task_of(ik, on_box("LHand", 0.43, 0.17))
-    k = OUTER[name].optimise(ik, task, ik.world.home, KeyframeOptions(**options))
+    k = OUTER[name](ik, task, ik.world.home, KeyframeOptions(**options))
     assert k.iterations <= most < results[name].iterations
     assert k.status is Status.SOLVED  # stopped early, still closed and balanced
     assert k.cost_after < k.cost_before
@@ -372,7 +370,7 @@ def test_each_rule_stops_by_itself(ik, results, name, options, most):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_nothing_new_to_optimise_is_no_mistake(ik, name):
-    k = METHODS[name].optimise(ik, task_of(ik), ik.world.home, KeyframeOptions())
+    k = METHODS[name](ik, task_of(ik), ik.world.home, KeyframeOptions())
     assert k.status is Status.SOLVED
     assert k.cost_before == k.cost_after == 0.0
     assert len(k.contacts) == 2
@@ -382,7 +380,7 @@ def test_nothing_new_to_optimise_is_no_mistake(ik, name):
 def test_the_same_task_has_the_same_keyframe_to_the_bit(ik, results, name):
     task = task_of(ik, on_box("LHand", 0.43, 0.17))
     fresh = IK(ik.world)
-    again = METHODS[name].optimise(fresh, task, ik.world.home, KeyframeOptions())
+    again = METHODS[name](fresh, task, ik.world.home, KeyframeOptions())
     np.testing.assert_array_equal(again.q, results[name].q)
     assert again.cost_after == results[name].cost_after
 
@@ -399,14 +397,14 @@ def test_a_box_that_is_too_far_is_unreachable():
     )
     far = IK(build_world(load_robot("coman"), Scene(boxes=(box,), start=np.zeros(3))))
     task = task_of(far, on_box("LHand", 1.6, 0.1))
-    k = direct.optimise(far, task, far.world.home, KeyframeOptions())
+    k = direct(far, task, far.world.home, KeyframeOptions())
     assert k.status is Status.UNREACHABLE
 
 
 def test_a_fixed_contact_stays_where_it_is_said_to_be(ik):
     wanted = on_box("LHand", 0.40, 0.2)
     task = task_of(ik, wanted, fixed=True)
-    k = direct.optimise(ik, task, ik.world.home, KeyframeOptions())
+    k = direct(ik, task, ik.world.home, KeyframeOptions())
     assert k.status is Status.SOLVED
     found = k.contacts[-1].contact.position
     np.testing.assert_allclose(found, wanted.position, atol=5e-4)

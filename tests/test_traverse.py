@@ -26,9 +26,9 @@ from clamber.planning.traverse import (
     quadrupedal_posture,
 )
 from clamber.run.folder import load_plan, save_plan
-from clamber.step import direct
 from clamber.step.change import Failure, standing
 from clamber.step.ik import IK
+from clamber.step.methods import direct
 from clamber.step.path import interpolate, overlap, watched_pairs
 from clamber.step.posture import KeyframeTask
 from clamber.step.stability import contact_drift
@@ -260,7 +260,7 @@ def test_a_plan_with_its_policy_survives_disk(crossing, tmp_path):
 def followed_from(ik: IK, q: np.ndarray, stance: tuple[Contact, ...], changes: int):
     """From a posture that is stable on some contacts."""
     task = KeyframeTask(held=stance, new=(), q_reference=q)
-    key = direct.optimise(ik, task, q, OPTIONS.keyframe)
+    key = direct(ik, task, q, OPTIONS.keyframe)
     found = follow_policy(ik, POLICY, key, OPTIONS, changes)
     assert not found.route.failures
     return found.route

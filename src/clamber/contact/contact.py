@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from clamber.model.records import short_repr
 from clamber.model.scene import GROUND, Scene
 
 Region = Literal["G", "M", "O"]
@@ -57,6 +58,8 @@ class Contact:
     link: np.ndarray | None = None
     fixed: bool = False
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""
         for name, n in (("position", 3), ("quaternion", 4)):
@@ -93,6 +96,8 @@ class Stance:
     contacts: tuple[Contact, ...]
     posture: Mapping[str, np.ndarray] = field(default_factory=dict)
     pelvis: np.ndarray | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that no surface appears twice, the directions and the pelvis."""
@@ -136,6 +141,8 @@ class ContactInterval:
     t1: float
     contact: Contact
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ContactSequence:
@@ -156,6 +163,8 @@ class ContactSequence:
     stances: tuple[Stance, ...]
     t: np.ndarray
     intervals: tuple[ContactInterval, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that times increase and that the scene has every support."""

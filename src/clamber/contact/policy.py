@@ -24,6 +24,7 @@ from typing import Literal
 import numpy as np
 
 from clamber.contact.contact import PARTS, Region, Stance
+from clamber.model.records import short_repr
 from clamber.model.scene import Edge, Scene, Support
 from clamber.model.se3 import wrap
 
@@ -50,6 +51,8 @@ class DemoPolicy:
     subject: Mapping[str, float]
     states: tuple[Stance, ...]
     actions: tuple[str | None, ...]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that there is one more state than actions, and the surfaces."""
@@ -121,6 +124,8 @@ class PelvisDistribution:
     sigma: np.ndarray
     samples: int
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Copy the arrays, wrap the means and check that nothing is negative."""
         mean, sigma = (np.array(x, dtype=float) for x in (self.mean, self.sigma))
@@ -174,6 +179,8 @@ class GeneralPolicy:
     demos: tuple[DemoPolicy, ...] = ()
     notes: tuple[str, ...] = ()
     secondary: tuple[GeneralPolicy, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that there are options, that they follow one another, the surfaces."""

@@ -18,6 +18,7 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics, limb_lengths
+from clamber.model.records import short_repr
 from clamber.model.scene import GROUND, Support
 from clamber.model.se3 import matrix_from_quat, quat_from_matrix
 from clamber.model.world import World
@@ -27,6 +28,8 @@ from clamber.model.world import World
 class _Edge:
     origin: np.ndarray
     rotation: np.ndarray  # R_WE
+
+    __repr__ = short_repr
 
     def to_local(self, p: np.ndarray) -> np.ndarray:
         return self.rotation.T @ (p - self.origin)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.model.records import short_repr
 from clamber.model.world import World
 
 NOT_SHOWN = Stance(contacts=())  # of a step that no demonstration shows
@@ -25,6 +26,8 @@ class Seeds:
 
     shifted: np.ndarray | None = None
     touching: np.ndarray | None = None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -59,6 +62,8 @@ class Step:
     stands_up: bool = False
     index: int | None = None
 
+    __repr__ = short_repr
+
     def __str__(self) -> str:
         """Such as `LHand -> LElbow on box`."""
         made = f"{self.makes.surface} on {self.makes.support}" if self.makes else "air"
@@ -76,6 +81,8 @@ class Skipped:
 
     stance: int
     reason: str
+
+    __repr__ = short_repr
 
 
 def split_moves(

@@ -31,9 +31,9 @@ from clamber.planning.trajectory import (
     build_trajectory,
 )
 from clamber.planning.traverse import follow_policy
-from clamber.step import direct
 from clamber.step.change import Failure, standing
 from clamber.step.ik import IK, NO_EXTRA, ExtraClearance
+from clamber.step.methods import direct
 from clamber.step.path import ARC_WEIGHT, Phase, bridge
 from clamber.step.posture import Keyframe, KeyframeTask
 from clamber.step.stability import contact_points
@@ -134,7 +134,7 @@ def settle(
     problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
     here = ik.solve_hard(problem, now.q)
     task = KeyframeTask(held=now.stance, new=(), q_reference=here.q)
-    key = direct.optimise(ik, task, here.q, options.keyframe)
+    key = direct(ik, task, here.q, options.keyframe)
     if key.status is not Status.SOLVED:
         return key, ()
     begin = here.q.copy()

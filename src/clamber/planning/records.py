@@ -14,7 +14,8 @@ from clamber.contact.steps import Skipped
 from clamber.model.records import frozen_array, short_repr
 from clamber.model.world import World
 from clamber.planning.trajectory import Trajectory
-from clamber.step.change import Change, Failure, Method
+from clamber.step.change import Change, Failure
+from clamber.step.methods import Method
 from clamber.step.posture import Keyframe, KeyframeOptions
 
 Progress = Callable[[str, float, str], None]

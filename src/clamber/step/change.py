@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -15,8 +14,8 @@ from clamber.model.records import short_repr
 from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
 from clamber.model.world import World
-from clamber.step import direct, gradient, lbfgs
 from clamber.step.ik import IK
+from clamber.step.methods import METHODS, Method, direct
 from clamber.step.path import Phase, plan_path
 from clamber.step.posture import (
     Keyframe,
@@ -32,13 +31,6 @@ from clamber.step.transition import (
     plan_transition,
     rolled,
 )
-
-Method = Literal["direct", "lbfgs", "gradient"]
-METHODS = {
-    "direct": direct.optimise,
-    "lbfgs": lbfgs.optimise,
-    "gradient": gradient.optimise,
-}
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -287,4 +279,4 @@ def _keyframe_there(
     """A stable posture with the new contact at, or nearest to, a given place."""
     contact, solution = approach_contact(ik, task.held, wanted, q, step.seeds.touching)
     fixed = replace(task, new=(contact,), fixed=True)
-    return direct.optimise(ik, fixed, solution.q, options)
+    return direct(ik, fixed, solution.q, options)

@@ -29,6 +29,7 @@ import numpy as np
 
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.statics import com_margin, support_polygon
 from clamber.step.tasks import (
@@ -102,6 +103,8 @@ class PostureProblem:
     ellipse_weight: float = 0.0
     lean: tuple[str, np.ndarray, float] | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Residuals:
@@ -122,6 +125,8 @@ class Residuals:
     limits: float
     worst_pair: int
     com_margin: float
+
+    __repr__ = short_repr
 
     @property
     def worst(self) -> float:
@@ -155,6 +160,8 @@ class Solution:
     iterations: int
     residuals: Residuals
     converged: bool
+
+    __repr__ = short_repr
 
     @property
     def status(self) -> Status:
@@ -206,6 +213,8 @@ class QP:
     sense: np.ndarray
     merit: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Asked:
@@ -215,6 +224,8 @@ class _Asked:
     tasks: list[Task]
     balance: Balance
     distance: Distance
+
+    __repr__ = short_repr
 
 
 class IK:

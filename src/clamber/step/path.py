@@ -18,6 +18,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.scene import Support
 from clamber.model.world import World
 from clamber.step.ik import IK, PostureProblem
@@ -63,6 +64,8 @@ class Phase:
     load_after: tuple[Contact, ...]
     arc: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Path:
@@ -72,6 +75,8 @@ class Path:
     phases: tuple[Phase, ...]
     status: Status
     note: str = ""
+
+    __repr__ = short_repr
 
 
 def arc(

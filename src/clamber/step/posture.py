@@ -20,6 +20,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
 from clamber.step.ik import (
@@ -59,6 +60,8 @@ class KeyframeTask:
     )
     base_rotation: np.ndarray | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class KeyframeOptions:
@@ -86,6 +89,8 @@ class KeyframeOptions:
     max_iterations: int = 200
     learning_rate: float = 0.1
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Keyframe:
@@ -102,6 +107,8 @@ class Keyframe:
     iterations: int
     cost_before: float
     cost_after: float
+
+    __repr__ = short_repr
 
     @property
     def stance(self) -> tuple[Contact, ...]:

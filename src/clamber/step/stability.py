@@ -15,6 +15,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.statics import (
     BALANCE_TOL,
@@ -54,6 +55,8 @@ class ContactState:
     projected_distance: float
     contact_angle: float
     phase: Phase
+
+    __repr__ = short_repr
 
 
 def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> ContactState:

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
+from clamber.model.records import short_repr
+
 GRAVITY = 9.81  # [m/s^2]
 MAX_CONTACT_ANGLE = math.radians(25.0)  # found by experiment in the thesis
 CONE_EDGES = 4
@@ -238,6 +240,8 @@ class SupportEllipse:
     foci: np.ndarray
     string_length: float
 
+    __repr__ = short_repr
+
     def excess(self, com: ArrayLike) -> tuple[float, np.ndarray]:
         """Summed distance of a point to the foci less the string length (4.28).
 
@@ -341,6 +345,8 @@ class ContactPoints:
     names: Sequence[str]
     cone_edges: int = CONE_EDGES
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         """Check that the shapes agree."""
         n = len(self.points)
@@ -366,6 +372,8 @@ class Load:
     com: np.ndarray
     mass: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TorqueLimits:
@@ -386,6 +394,8 @@ class TorqueLimits:
     dofs: np.ndarray
     limits: np.ndarray
     names: Sequence[str]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that the shapes agree."""
@@ -418,6 +428,8 @@ class ContactForces:
     forces: np.ndarray
     residual: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class StaticEquilibrium:
@@ -444,6 +456,8 @@ class StaticEquilibrium:
     limiting: str | None
     forces: np.ndarray
     torques: np.ndarray | None = None
+
+    __repr__ = short_repr
 
 
 def contact_frames(normals: np.ndarray) -> np.ndarray:
@@ -670,6 +684,8 @@ class _PushLP:
     b_eq: np.ndarray
     A_ub: np.ndarray
     b_ub: np.ndarray
+
+    __repr__ = short_repr
 
 
 def _build_push_lp(

@@ -16,6 +16,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.contact.steps import Seeds, Step
 from clamber.errors import Status
+from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.ik import (
     IK,
@@ -68,6 +69,8 @@ class Transition:
     status: Status
     residuals: Residuals
     note: str = ""
+
+    __repr__ = short_repr
 
     @property
     def leaving(self) -> tuple[Contact, ...]:
