@@ -18,8 +18,8 @@ from matplotlib.patches import Ellipse, Polygon, Rectangle
 import clamber
 from clamber.execution.terrain import fitted_box
 from clamber.model.kinematics import Kinematics
+from clamber.run.figures import finish_axes, save_plot
 from clamber.show.pictures import mark_keyframe
-from clamber.show.plots import finish_axes, save_plot
 from clamber.show.renderer import Camera, view_of
 from clamber.step.posture import STABILITY_WEIGHT
 from clamber.step.statics import support_ellipse, support_polygon

@@ -21,7 +21,7 @@ from clamber.model.robot import Robot
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
-from clamber.run.codec import whole_file
+from clamber.run.figures import finish_axes, save_plot
 from clamber.show.sample import Motion
 
 CYCLE_COLOURS = ("#fde68a", "#bfdbfe", "#bbf7d0", "#fecaca", "#e9d5ff")  # in order
@@ -150,21 +150,6 @@ def cost_to_go_plot(plan: Plan, path: str | Path) -> Path:
     ax.set_ylabel("cost-to-go [m]")
     finish_axes(ax)
     return save_plot(fig, path)
-
-
-def finish_axes(ax: Axes) -> None:
-    """Legend, two spines, small labels."""
-    ax.legend(fontsize=8, frameon=False, loc="upper right")
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(labelsize=8)
-
-
-def save_plot(fig: Figure, path: str | Path) -> Path:
-    """Write a figure whole, without the date or version of what drew it."""
-    path = Path(path)
-    with whole_file(path) as draft:
-        fig.savefig(draft, dpi=110, metadata={"Software": None})
-    return path
 
 
 # Policies.

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from clamber.run.codec import whole_file
-from clamber.show.plots import finish_axes, save_plot
+from clamber.run.figures import finish_axes, save_plot
 from clamber.study.climb import ClimbResult
 from clamber.study.spec import Spec, Strand, strands
 from clamber.study.statistics import Break, fit_break, wilson
