@@ -218,7 +218,6 @@ def _arrow(
 
 
 def climb_sheet(
-    plan: Plan,
     rollout: Rollout,
     path: str | Path,
     *,
@@ -306,7 +305,7 @@ def render_run(
     files.append(keyframe_sheet(plan, folder / "keyframes.png"))
     if rollout is not None:
         tell("pictures", 0.7, "climb")
-        files.append(climb_sheet(plan, rollout, folder / "climb.png"))
+        files.append(climb_sheet(rollout, folder / "climb.png"))
         tell("pictures", 1.0, "")
         if with_video:
             files.append(video(plan, rollout, folder, report=tell))
