@@ -67,8 +67,8 @@ from clamber.planning.stairs import CLEAR, FLUSH, Flight
 from clamber.step.change import home_at
 from clamber.step.posture import Keyframe
 
-TURN = 0.25  # [rad] of the body in one cycle on all fours: more, and limbs cross
-STEP_TURN = 0.30  # [rad] of the body in one cycle on its feet
+TURN = 0.25  # [rad] of the body in one cycle on all fours, at most
+STEP_TURN = 0.30  # [rad] of the body in one step of each foot, at most
 SHARES = (1.0, 0.6, 0.3)  # of its length: a step that fails is tried shorter
 RISER_SHARES = (1.0, 0.5, 0.25)  # ... a cycle over a riser
 NEARER = (0.0, 0.4)  # share of the way to a limb that is stuck, to stand around it

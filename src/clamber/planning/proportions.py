@@ -18,22 +18,18 @@ from clamber.model.robot import Limb
 from clamber.model.se3 import turn_about_z
 
 STEPS = 3.0  # f of (5.9): a step is this part of a limb's length, or as was shown
-# Where the body stands before an edge, in lengths of its legs: nearer, knees meet the
-# edge; farther, the weight does not get over the hands.
-STAND = 0.54
+STAND = 0.54  # lengths of a leg from the feet to an edge that is to be climbed
 REACH = 0.65  # lengths of an arm that hands reach beyond a stand
-# Contacts while climbing, from the edge inwards: in steps of the limb. Knees nearer to
-# the edge slip off it, hands and elbows farther from it do not bear the trunk.
+# Contacts while climbing, from the edge inwards: in steps of the limb.
 DEPTH = {"hand": 2.0, "elbow": 1.4, "knee": 0.35}
-# Contacts on all fours, ahead of the body's middle or behind it in lengths of the
-# trunk, and to its side in half distances between shoulders or hips: narrower, and the
-# robot tips over; longer, and neither arms nor legs can let go.
+# Contacts on all fours: ahead of the body's middle or behind it in lengths of the trunk
+# (shorter, and more cycles fail: limbs that are near one another cannot let go), and to
+# its side in half distances between shoulders or hips.
 AHEAD, BESIDE_ARMS, BESIDE_LEGS = 0.35, 1.1, 1.35
 STRETCH = 0.57  # lengths of the trunk from the body's middle to hands or knees
-# While climbing, to the side in what it is on all fours: hands together bear the trunk
-# before the elbows come, outside of them.
+# While climbing, to the side: shares of what it is on all fours.
 HANDS_BESIDE, KNEES_BESIDE = 0.36, 0.9
-BEHIND = 0.8  # lengths of a body on all fours from an edge before it climbs down
+BEHIND = 0.8  # share of the way from an edge to where the body is after a climb
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

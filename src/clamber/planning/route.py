@@ -20,13 +20,11 @@ from clamber.model.se3 import quat_from_matrix, turn_about_z
 
 GAP = 0.40  # [m] a narrower gap is crossed on top, a wider one on the ground
 JOINT = 0.02  # [m] a narrower gap is none
-# [m] An edge is climbed so far from its ends, where it is that long: nearer to them, a
-# hand or a knee finds no place on its side.
-BESIDE = 0.25
+BESIDE = 0.25  # [m] an edge is climbed so far from its ends, where it is that long
 SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
 FACING = 0.15  # [rad] from how it shall face
-BORDER = 0.02  # [m] contacts stay so far inside a top's border: less, and they slip off
+BORDER = 0.02  # [m] contacts stay so far inside a top's border
 GRID = 0.02  # [m] of the search for a place: coarser, and it misses narrow ones
 # [m] A place is looked for this far around where it is wanted: less than half of `GAP`,
 # and there is none over the middle of a gap.
