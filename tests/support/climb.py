@@ -1,10 +1,10 @@
-"""The built-in demonstration: a person climbs a box on hands, elbows and knees.
+"""A person climbs a box on hands, elbows and knees; the true contacts are known.
 
-No recording of this climb is free to ship, so it is made here, says so in its source
-and knows its true contacts. Key poses of pelvis and chest are moved the least that lets
-the limbs reach what they hold on to; between key poses they move with minimum jerk,
-corrected in the same way, so that what is in contact keeps still to the last digit.
-Limbs follow by two-bone inverse kinematics with constant lengths.
+No recording of this climb is free to ship, so that the built-in one is made here. Key
+poses of pelvis and chest are moved the least that lets the limbs reach what they hold
+on to; between key poses they move with minimum jerk, corrected in the same way, so that
+what is in contact keeps still to the last digit. Limbs follow by two-bone inverse
+kinematics with constant lengths.
 
 World: origin between the ankles, x towards the box, z up. Shapes: T samples.
 """
@@ -16,15 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from clamber.contact.contact import Contact, ContactInterval
-from clamber.model.scene import GROUND, Box, Scene
-from clamber.model.se3 import frame_from_normal, quat_from_matrix
-from clamber.recording.demonstration import (
-    SIDES,
-    Demonstration,
-    RawTracks,
-    build_demonstration,
-)
+from clamber.contact.contact import ContactInterval
+from clamber.recording.demonstration import SIDES, Demonstration
 from support.figure import (
     ANKLE,
     ELBOW,
@@ -44,19 +37,18 @@ from support.figure import (
     Tracks,
     bend,
     blend,
-    corrupt,
     ease,
     hit,
     hop,
     joint_of,
     kick,
-    mirror_contact,
-    mirror_tracks,
     reach,
+    recorded,
     rotate,
     settle,
     sway,
     toe_pivot,
+    touched,
     unit,
 )
 
@@ -74,8 +66,6 @@ class ClimbOptions:
         noise: Standard deviation of a marker's coordinates [m].
         gaps: How many short stretches of markers are missing.
         rate: [Hz].
-        near_face: From the ankles to the box [m]; by default 0.42, more before a low
-            box, where knees that bend need the room.
         hand: Wrist's depth behind the near edge and distance to the side [m].
         elbow_side: Elbow's distance to the side [m]; its depth follows, since the
             forearm lies down around the hand, which stays where it is.
@@ -88,7 +78,6 @@ class ClimbOptions:
     noise: float = 0.002
     gaps: int = 6
     rate: float = 120.0
-    near_face: float | None = None
     hand: tuple[float, float] = (0.41, 0.06)
     elbow_side: float = 0.255
     knee: tuple[float, float] = (0.15, 0.165)
@@ -100,9 +89,7 @@ class ClimbOptions:
 
     @property
     def edge(self) -> float:
-        """Depth of the near edge [m]."""
-        if self.near_face is not None:
-            return self.near_face
+        """Depth of the near edge [m]: knees that bend before a low box need room."""
         return 0.42 + 0.6 * max(0.0, 0.47 - self.height)
 
 
@@ -138,29 +125,9 @@ def synthesize_climb(
     Returns:
         The recording and its true contacts by start time.
     """
-    options = options or ClimbOptions()
-    tracks, truth = clean_motion(rng, options)
-    if options.mirrored:
-        tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
-    raw = corrupt(tracks, rng, options.noise, options.gaps, options.rate)
-    demo = build_demonstration(
-        RawTracks(
-            source=f"built-in climb, synthetic (noise {1e3 * options.noise:g} mm)",
-            synthetic=True,
-            names=tuple(tracks),
-            position=raw,
-            rate=options.rate,
-            scene=_scene(options),
-        )
-    )
-    return demo, sorted(truth, key=lambda i: (i.t0, i.part))
-
-
-def _scene(o: ClimbOptions) -> Scene:
+    o = options or ClimbOptions()
     size = np.array([BOX_WIDTH, BOX_LENGTH, o.height])
-    position = np.array([o.edge + BOX_WIDTH / 2, 0.0, o.height / 2])
-    box = Box(name="table", size=size, position=position, rotation=np.eye(3))
-    return Scene(boxes=(box,), start=np.zeros(3))
+    return recorded("climb", clean_motion(rng, o), (size, o.edge), rng, o)
 
 
 # Where parts rest.
@@ -221,17 +188,7 @@ def _wanted(o: ClimbOptions, first: str) -> np.ndarray:
         "second elbow": (0.21, 0, hips, 1.0, wrist - 0.10, 0, h + 0.32, 1.5, 0),
         "first toe-off": (0.19, -0.04, hips, 1.0, wrist - 0.07, 0, h + 0.32, 1.5, 0),
         "first knee": (0.29, -0.02, h + 0.37, 1.0, wrist - 0.04, 0, h + 0.31, 1.5, 0),
-        "second toe-off": (
-            0.31,
-            0.04,
-            h + 0.38,
-            1.0,
-            wrist - 0.03,
-            0,
-            h + 0.30,
-            1.5,
-            0,
-        ),
+        "second toe-off": (0.31, 0.04, h + 0.38, 1.0, wrist - 0.03, 0, h + 0.3, 1.5, 0),
         "second knee": (0.33, 0.01, h + 0.39, 1.0, wrist - 0.01, 0, h + 0.29, 1.5, 0),
         "settled": (0.31, 0, h + 0.375, 1.0, wrist - 0.03, 0, h + 0.30, 1.45, 0),
         "end": (0.31, 0, h + 0.375, 1.0, wrist - 0.03, 0, h + 0.30, 1.45, 0),
@@ -457,36 +414,15 @@ def _true_contacts(
 ) -> list[ContactInterval]:
     """What is in contact by construction."""
     holds, out = _holds(o), []
-    up = np.array([0.0, 0.0, 1.0])
     for s, order in _orders(first):
-        knee, forearm = np.array([1.0, 0.0, 0.0]), holds.wrist[s] - holds.elbow[s]
-        when = {
-            k: float(at[_KEY[f"{order} {k}"]])
-            for k in ("hand", "elbow", "toe-off", "knee")
-        }
-        rows = (
-            (
-                "Foot",
-                GROUND,
-                0.0,
-                when["toe-off"],
-                holds.ankle[s],
-                holds.toe[s] - holds.ankle[s],
-            ),
-            ("Hand", "table", when["hand"], end, holds.wrist[s], holds.heading[s]),
-            ("Elbow", "table", when["elbow"], end, holds.elbow[s], forearm),
-            ("Knee", "table", when["knee"], end, holds.knee[s], knee),
-        )
-        for part, support, t0, t1, p, heading in rows:
-            contact = Contact(
-                surface=s + part,
-                support=support,
-                position=np.array([p[0], p[1], 0.0 if support == GROUND else o.height]),
-                quaternion=quat_from_matrix(frame_from_normal(up, heading)),
-            )
-            out.append(
-                ContactInterval(
-                    part=s + part, is_surface=True, t0=t0, t1=t1, contact=contact
-                )
-            )
+        steps = ("hand", "elbow", "toe-off", "knee")
+        hand, elbow, off, knee = (at[_KEY[f"{order} {k}"]] for k in steps)
+        sole, forearm = holds.toe[s] - holds.ankle[s], holds.wrist[s] - holds.elbow[s]
+        shank = np.array([1.0, 0.0, 0.0])
+        out += [
+            touched(s + "Foot", holds.ankle[s], sole, 0.0, off, o.height),
+            touched(s + "Hand", holds.wrist[s], holds.heading[s], hand, end, o.height),
+            touched(s + "Elbow", holds.elbow[s], forearm, elbow, end, o.height),
+            touched(s + "Knee", holds.knee[s], shank, knee, end, o.height),
+        ]
     return out

@@ -22,20 +22,9 @@ from typing import Literal
 
 import numpy as np
 
-from clamber.contact.contact import Contact, ContactInterval
-from clamber.model.scene import GROUND, Box, Scene
-from clamber.model.se3 import (
-    frame_from_normal,
-    matrix_from_rpy,
-    quat_from_matrix,
-    rotation_vector,
-)
-from clamber.recording.demonstration import (
-    SIDES,
-    Demonstration,
-    RawTracks,
-    build_demonstration,
-)
+from clamber.contact.contact import ContactInterval
+from clamber.model.se3 import matrix_from_rpy, rotation_vector
+from clamber.recording.demonstration import SIDES, Demonstration
 from support.figure import (
     ANKLE,
     ELBOW,
@@ -53,23 +42,21 @@ from support.figure import (
     Tracks,
     bend,
     blend,
-    corrupt,
     ease,
     hit,
     hop,
     joint_of,
     kick,
-    mirror_contact,
-    mirror_tracks,
     reach,
+    recorded,
     rotate,
     settle,
     sway,
     toe_pivot,
+    touched,
     unit,
 )
 
-TABLE = "table"
 NEAR_FACE = 0.42  # [m] from the ankles to the table
 STRETCH = 0.995  # of a limb's length: no one locks a joint
 UP = np.array([0.0, 0.0, 1.0])
@@ -118,27 +105,8 @@ def synthesize_crossing(
         The recording and its true contacts by start time.
     """
     o = options or CrossingOptions()
-    tracks, truth = clean_motion(rng, o)
-    if o.mirrored:
-        tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
-    demo = build_demonstration(
-        RawTracks(
-            source=f"built-in crossing, synthetic (noise {1e3 * o.noise:g} mm)",
-            synthetic=True,
-            names=tuple(tracks),
-            position=corrupt(tracks, rng, o.noise, o.gaps, o.rate),
-            rate=o.rate,
-            scene=_scene(o),
-        )
-    )
-    return demo, sorted(truth, key=lambda i: (i.t0, i.part))
-
-
-def _scene(o: CrossingOptions) -> Scene:
     size = np.array([o.length, o.width, o.height])
-    position = np.array([NEAR_FACE + o.length / 2, 0.0, o.height / 2])
-    box = Box(name=TABLE, size=size, position=position, rotation=np.eye(3))
-    return Scene(boxes=(box,), start=np.zeros(3))
+    return recorded("crossing", clean_motion(rng, o), (size, NEAR_FACE), rng, o)
 
 
 # What limbs hold on to.
@@ -834,13 +802,4 @@ def _contact(
         "Foot": hold.b - hold.a,
         "Knee": -hold.b,
     }[kind]
-    on_ground = kind == "Foot"
-    contact = Contact(
-        surface=part,
-        support=GROUND if on_ground else TABLE,
-        position=np.array([p[0], p[1], 0.0 if on_ground else height]),
-        quaternion=quat_from_matrix(frame_from_normal(UP, heading)),
-    )
-    return ContactInterval(
-        part=part, is_surface=True, t0=float(t0), t1=float(t1), contact=contact
-    )
+    return touched(part, p, heading, t0, t1, height)

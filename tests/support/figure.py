@@ -7,11 +7,20 @@ Limbs follow by two-bone inverse kinematics with constant lengths. Shapes: T sam
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from clamber.contact.contact import ContactInterval
+from clamber.contact.contact import Contact, ContactInterval
+from clamber.model.scene import GROUND, Box, Scene
+from clamber.model.se3 import frame_from_normal, quat_from_matrix
+from clamber.recording.demonstration import (
+    Demonstration,
+    RawTracks,
+    build_demonstration,
+)
 
+TABLE = "table"
 Tracks = dict[str, np.ndarray]
 
 THIGH, SHANK, UPPER_ARM, FOREARM = 0.373, 0.453, 0.311, 0.254  # [m]
@@ -198,6 +207,71 @@ def mirror_contact(i: ContactInterval) -> ContactInterval:
         quaternion=np.array([w, -x, y, -z]),
     )
     return replace(i, part=_swap(i.part), contact=contact)
+
+
+def touched(
+    part: str, p: np.ndarray, heading: np.ndarray, t0: float, t1: float, top: float
+) -> ContactInterval:
+    """A true contact at the depth and side of p (3,): feet's on the ground."""
+    on_ground = part.endswith("Foot")
+    R = frame_from_normal(np.array([0.0, 0.0, 1.0]), heading)
+    contact = Contact(
+        surface=part,
+        support=GROUND if on_ground else TABLE,
+        position=np.array([p[0], p[1], 0.0 if on_ground else top]),
+        quaternion=quat_from_matrix(R),
+    )
+    return ContactInterval(
+        part=part, is_surface=True, t0=float(t0), t1=float(t1), contact=contact
+    )
+
+
+class Options(Protocol):
+    """What synthetic demonstrations have in common."""
+
+    @property
+    def mirrored(self) -> bool: ...
+    @property
+    def noise(self) -> float: ...
+    @property
+    def gaps(self) -> int: ...
+    @property
+    def rate(self) -> float: ...
+
+
+def recorded(
+    kind: str,
+    motion: tuple[Tracks, list[ContactInterval]],
+    table: tuple[np.ndarray, float],
+    rng: np.random.Generator,
+    o: Options,
+) -> tuple[Demonstration, list[ContactInterval]]:
+    """The demonstration that cameras see of a clean motion, and its true contacts.
+
+    Args:
+        kind: What it is called.
+        motion: Exact tracks and true contacts.
+        table: Its size, and the depth of its near face [m].
+        rng: Drives noise and gaps.
+        o: How it is recorded.
+    """
+    tracks, truth = motion
+    if o.mirrored:
+        tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
+    size, face = table
+    position = np.array([face + size[0] / 2, 0.0, size[2] / 2])
+    box = Box(name=TABLE, size=size, position=position, rotation=np.eye(3))
+    demo = build_demonstration(
+        RawTracks(
+            source=f"built-in {kind}, synthetic (noise {1e3 * o.noise:g} mm)",
+            synthetic=True,
+            names=tuple(tracks),
+            position=corrupt(tracks, rng, o.noise, o.gaps, o.rate),
+            rate=o.rate,
+            scene=Scene(boxes=(box,), start=np.zeros(3)),
+        )
+    )
+    return demo, sorted(truth, key=lambda i: (i.t0, i.part))
 
 
 def corrupt(

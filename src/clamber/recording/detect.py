@@ -113,6 +113,7 @@ _REST = 0.3  # [s] from whose median a resting place is read
 _SEARCH = 0.5  # [s] a change lies at most so far inside its coarse interval
 _AROUND = 0.1  # [s] half the stretch of track that the fit looks at
 _STILL = 0.015  # [m] a part that rolls in place changes height by less than this
+_SIGMAS = 4.5  # so many standard deviations of a smoothed track are no motion
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -457,7 +458,7 @@ def _refine(
     around = tracks.samples(_AROUND)
     ahead = min(i + tracks.samples(_SEARCH), (i + j) // 2)
     resting = support.height(raw)[ahead : min(ahead + tracks.samples(_REST), j)]
-    still = max(_STILL, 4.5 * noise_of(raw) / 2.0)  # smoothing halves the noise
+    still = max(_STILL, _SIGMAS * noise_of(raw) / 2.0)  # smoothing halves the noise
     start = max(i - around, 0)
     # No part rests above its place.
     away = support.height(smooth)[start : ahead + 1] - np.median(resting) > still
