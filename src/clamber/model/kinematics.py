@@ -352,18 +352,10 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def limb_lengths(kin: Kinematics) -> dict[str, float]:
     """Segment lengths of the robot by the names of a subject's [m]."""
-    out = {}
-    for part, names in (
-        ("upper_arm", ("root", "middle")),
-        ("forearm", ("middle", "end")),
-        ("thigh", ("root", "middle")),
-        ("shank", ("middle", "end")),
-    ):
-        limbs = [
-            x
-            for x in kin.world.robot.limbs.values()
-            if x.is_arm == (part in ("upper_arm", "forearm"))
-        ]
-        ends = [[kin.landmark(getattr(x, n))[1] for n in names] for x in limbs]
-        out[part] = float(np.mean([np.linalg.norm(b - a) for a, b in ends]))
-    return out
+    out: dict[str, list[float]] = {}
+    for limb in kin.world.robot.limbs.values():
+        a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
+        near, far = ("upper_arm", "forearm") if limb.is_arm else ("thigh", "shank")
+        out.setdefault(near, []).append(float(np.linalg.norm(b - a)))
+        out.setdefault(far, []).append(float(np.linalg.norm(c - b)))
+    return {part: float(np.mean(lengths)) for part, lengths in out.items()}

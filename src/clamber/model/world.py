@@ -317,8 +317,7 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
             g: s.name
             for s in scene.supports
             for g in range(model.ngeom)
-            if model.geom_bodyid[g] == 0
-            and (model.geom(g).name == s.name or has_prefix(model.geom(g).name, s.name))
+            if model.geom_bodyid[g] == 0 and has_prefix(model.geom(g).name, s.name)
         },
         supports={s.name: s for s in scene.supports},
         touching={
@@ -343,27 +342,25 @@ def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
     body = int(model.geom_bodyid[main])
     bodies = {int(model.geom_bodyid[g]) for g in geoms}
     if len(bodies) > 1:
-        raise InputError(
-            "one body for each surface",
-            field=name,
-            value=sorted(model.body(b).name for b in bodies),
-        )
+        names = sorted(model.body(b).name for b in bodies)
+        raise InputError("one body for each surface", None, name, names)
     kind, size = mujoco.mjtGeom(int(model.geom_type[main])), model.geom_size[main]
     p_BG, R_BG = model.geom_pos[main].copy(), matrix_from_quat(model.geom_quat[main])
     R_WB = data.xmat[body].reshape(3, 3)
+    out = Surface(
+        name=name,
+        body=body,
+        geoms=tuple(geoms),
+        centre=p_BG,
+        radius=0.0,
+        rotation=None,
+        corners=p_BG[None],
+    )
     if kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
         if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
             ends = p_BG + np.outer([-1.0, 1.0], R_BG[:, 2] * size[1])
             p_BG = ends[np.argmin((ends @ R_WB.T)[:, 2])]
-        return Surface(
-            name=name,
-            body=body,
-            geoms=tuple(geoms),
-            centre=p_BG,
-            radius=float(size[0]),
-            rotation=None,
-            corners=p_BG[None],
-        )
+        return replace(out, centre=p_BG, radius=float(size[0]), corners=p_BG[None])
     if kind != mujoco.mjtGeom.mjGEOM_BOX:
         p_BG = p_BG + R_BG @ model.geom_aabb[main, :3]
         size = model.geom_aabb[main, 3:]
@@ -386,15 +383,8 @@ def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
         offset = half.copy()
         offset[length], offset[other] = a * size[length], b * size[other]
         corners.append(p_BG + R_BG @ offset)
-    return Surface(
-        name=name,
-        body=body,
-        geoms=tuple(geoms),
-        centre=centre,
-        radius=0.0,
-        rotation=R_BG @ R_GC,
-        corners=np.array(corners),
-    )
+    rotation, corners = R_BG @ R_GC, np.array(corners)
+    return replace(out, centre=centre, rotation=rotation, corners=corners)
 
 
 def _stand(
