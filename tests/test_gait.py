@@ -592,6 +592,15 @@ def test_where_all_can_be_done_it_arrives_with_all_weight_on_one_after_the_other
         assert options[:3] == ["ac1", "ac2", "ac3"]
 
 
+def test_the_repr_of_all_that_is_proposed_is_short(wide):
+    able = Obstinate(wide, on_fours(wide, 1.0), lambda c: c.surface == "RKnee")
+    able.pursue()
+    climb, *_ = proposed(wide, on_feet())
+    records = [climb, wide.build, wide.build.stairs, *wide.platforms, *able.asked]
+    records += [p.after for p in able.asked] + [able.asked[2].goals[0]]
+    assert max(len(repr(r)) for r in records) < 300
+
+
 # What cannot be.
 
 

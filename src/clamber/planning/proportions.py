@@ -14,6 +14,7 @@ import numpy as np
 
 from clamber.contact.policy import GeneralPolicy
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.robot import Limb
 from clamber.model.se3 import turn_about_z
 
@@ -50,6 +51,8 @@ class StairSteps:
     span: float
     sides: Mapping[str, float]
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proportions:
@@ -82,6 +85,8 @@ class Proportions:
     stretch: float
     radius: float
     stairs: StairSteps
+
+    __repr__ = short_repr
 
     def mount(self, limb: Limb, surface: str) -> np.ndarray:
         """(2,) from an edge inwards, and to the left, where a climb sets a surface."""

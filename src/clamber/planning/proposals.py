@@ -12,6 +12,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.contact.steps import Step
 from clamber.errors import Status
+from clamber.model.records import short_repr
 from clamber.planning.route import Frame
 from clamber.step.change import Change, Failure
 from clamber.step.posture import Keyframe
@@ -26,6 +27,8 @@ class Goal:
 
     option: str
     contacts: tuple[Contact, ...]
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +60,8 @@ class Outcome:
     left: tuple[str, ...] = ()
     failure: Failure | None = None
 
+    __repr__ = short_repr
+
     @property
     def stance(self) -> tuple[Contact, ...]:
         """Of the keyframe."""
@@ -85,6 +90,8 @@ class Proposal:
     posture: Literal["quadrupedal", "upright", "home"] = "quadrupedal"
     accept: Accept = "all"
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Climb:
@@ -101,6 +108,8 @@ class Climb:
     steps: Sequence[tuple[Step, str]]
     start: np.ndarray | None = None
     accept: Accept = "all"
+
+    __repr__ = short_repr
 
 
 # Sent what came of each proposal; returns whether the goal has been reached.

@@ -15,6 +15,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.errors import InputError
+from clamber.model.records import short_repr
 from clamber.model.scene import GROUND_HALF_SIZE, Edge, Scene, Support
 from clamber.model.se3 import quat_from_matrix, turn_about_z
 
@@ -47,6 +48,8 @@ class Platform:
     exit: Edge | None
     gaps: tuple[np.ndarray, ...] = ()
 
+    __repr__ = short_repr
+
     @property
     def edges(self) -> tuple[Edge, ...]:
         """The edge that is climbed up, and that which is climbed down, if any."""
@@ -64,6 +67,8 @@ class Frame:
 
     xy: np.ndarray
     yaw: float
+
+    __repr__ = short_repr
 
     @classmethod
     def behind(cls, edge: Edge, distance: float = 0.0) -> Frame:

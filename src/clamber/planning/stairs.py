@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.model.records import short_repr
 from clamber.model.world import Surface, World
 from clamber.planning.proportions import StairSteps
 from clamber.planning.route import BORDER, Platform, contact_at, crossing
@@ -54,6 +55,8 @@ class Flight:
     platform: Platform
     goal: np.ndarray
     steps: StairSteps
+
+    __repr__ = short_repr
 
     def is_climbable(self) -> bool:
         """Whether each box is higher than the one before, with room for what steps.

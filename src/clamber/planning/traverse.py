@@ -15,6 +15,7 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.contact.policy import GeneralPolicy, pelvis_rotation
 from clamber.contact.steps import Step
+from clamber.model.records import short_repr
 from clamber.model.robot import Robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import quat_from_matrix
@@ -65,6 +66,8 @@ class Followed:
     route: Route
     iterations: tuple[Iteration, ...]
     fallback: Fallback | None
+
+    __repr__ = short_repr
 
 
 def plan_traverse(
