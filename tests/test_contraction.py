@@ -17,7 +17,6 @@ from clamber.contact.learn import (
     find_cycles,
     fit_distribution,
     learn_policy,
-    limb_of,
     pelvis_samples,
 )
 from clamber.contact.policy import GeneralPolicy, pelvis_rotation
@@ -56,10 +55,10 @@ class Person:
         self.down: dict[str, Contact] = {}
         self.stances: list[Stance] = []
         for foot in FEET:
-            self.down[foot] = self._contact(foot, "ground", 0.0)
+            self.down[foot] = self.contact(foot, "ground", 0.0)
         self.see()
 
-    def _contact(self, surface: str, support: str, x: float) -> Contact:
+    def contact(self, surface: str, support: str, x: float) -> Contact:
         return Contact(
             surface=surface,
             support=support,
@@ -91,7 +90,7 @@ class Person:
             self.lift(*gone)
         for s in gone:
             self.down.pop(s, None)
-        self.down[surface] = self._contact(surface, support, x)
+        self.down[surface] = self.contact(surface, support, x)
         self.see()
         return self
 
@@ -225,41 +224,38 @@ def test_the_table_has_an_action_for_each_contact_that_is_made():
     assert regions[-1] == "G"
 
 
-def test_a_limb_that_leaves_its_contact_is_part_of_its_next_action():
+def test_contacts_that_are_given_up_belong_to_the_next_action_or_are_a_state():
     demo = build_demo_policy(Person().put("LFoot", "ground", 0.3).sequence())
     assert demo.actions == ("LFoot",)
     assert set(demo.states[0].surfaces) == set(FEET)
-
-
-def test_contacts_given_up_while_another_limb_acts_are_a_state():
     person = Person().put("LHand", "table", 0.5).put("RHand", "table", 0.5)
-    person.lift("LHand").put("RFoot", "ground", 0.3)
+    person.lift("LHand").put("RFoot", "ground", 0.3)  # another limb acts meanwhile
     demo = build_demo_policy(person.sequence())
     assert demo.actions == ("LHand", "RHand", None, "RFoot")
     assert set(demo.states[3].surfaces) == {*FEET, "RHand"}
-
-
-def test_the_goal_is_what_holds_in_the_end():
     person = Person().put("LHand", "table", 0.5).lift("LHand")
     demo = build_demo_policy(person.sequence())
     assert demo.actions == ("LHand", None)
-    assert demo.states[-1].surfaces == FEET
+    assert demo.states[-1].surfaces == FEET  # the goal
 
 
-def test_of_contacts_that_stay_the_one_that_moved_furthest_acts():
-    person = Person().put("LHand", "table", 0.5).put("RHand", "table", 0.5)
-    for s, x in (("LHand", 0.58), ("RHand", 0.7)):
-        person.down[s] = replace(person.down[s], position=np.array([x, 0.0, HEIGHT]))
+@pytest.mark.parametrize(
+    ("made", "slid", "action"),
+    [
+        ({"LHand": 0.5, "RHand": 0.5}, {"LHand": 0.58, "RHand": 0.7}, "RHand"),
+        ({"LHand": 0.7, "LElbow": 0.5}, {"LHand": 0.91, "LElbow": 0.7}, "LElbow"),
+    ],
+)
+def test_of_contacts_that_stay_the_one_that_bears_and_moved_furthest_acts(
+    made, slid, action
+):
+    person = Person()
+    for s, x in made.items():
+        person.put(s, "table", x)
+    for s, x in slid.items():
+        person.down[s] = person.contact(s, "table", x)
     person.see()
-    assert build_demo_policy(person.sequence()).actions == ("LHand", "RHand", "RHand")
-
-
-def test_a_hand_that_moves_along_with_its_elbow_is_the_elbows_action():
-    person = Person().put("LHand", "table", 0.7).put("LElbow", "table", 0.5)
-    for s, x in (("LHand", 0.91), ("LElbow", 0.7)):
-        person.down[s] = replace(person.down[s], position=np.array([x, 0.0, HEIGHT]))
-    person.see()
-    assert build_demo_policy(person.sequence()).actions[-1] == "LElbow"
+    assert build_demo_policy(person.sequence()).actions == (*made, action)
 
 
 def test_states_that_repeat_are_merged():
@@ -275,7 +271,7 @@ def test_states_that_repeat_are_merged():
 def test_surfaces_that_touch_at_once_act_one_after_the_other():
     person = Person()
     for s in HANDS:
-        person.down[s] = person._contact(s, "table", 0.5)
+        person.down[s] = person.contact(s, "table", 0.5)
     person.see()
     demo = build_demo_policy(person.sequence())
     assert demo.actions == HANDS
@@ -287,32 +283,22 @@ def test_a_robots_own_plan_teaches_nothing():
         build_demo_policy(replace(crossing(), subject=None))
 
 
-def test_a_hand_that_lands_before_its_elbow_does_not_rule():
-    person = Person().put("LHand", "table", 0.6).put("LElbow", "table", 0.5)
-    person.lift("LElbow", "LHand")
-    person.put("LHand", "table", 0.8).put("LElbow", "table", 0.7)
-    demo = build_demo_policy(person.sequence())
-    assert demo.actions == ("LHand", "LElbow", "LHand", "LElbow")
-    assert dominant_actions(demo) == [0, 1, 3]
-
-
-def test_a_hand_that_lands_after_its_elbow_does_not_rule_either():
-    person = Person().put("LElbow", "table", 0.5).put("LHand", "table", 0.7)
-    demo = build_demo_policy(person.put("RHand", "table", 0.7).sequence())
-    assert dominant_actions(demo) == [0, 2]
-
-
-def test_a_hand_that_takes_over_from_its_elbow_rules():
-    person = Person().put("LElbow", "table", 0.5).put("RElbow", "table", 0.5)
+def test_a_hand_rules_only_where_its_elbow_does_not_bear():
+    """Landing before its elbow, after it, and taking over from it."""
+    before = Person().put("LHand", "table", 0.6).put("LElbow", "table", 0.5)
+    before.lift("LElbow", "LHand")
+    before.put("LHand", "table", 0.8).put("LElbow", "table", 0.7)
+    after = Person().put("LElbow", "table", 0.5).put("LHand", "table", 0.7)
+    after.put("RHand", "table", 0.7)
+    instead = Person().put("LElbow", "table", 0.5).put("RElbow", "table", 0.5)
     for s in HANDS:
-        person.put(s, "table", 0.5, leaves=s[0] + "Elbow")
-    demo = build_demo_policy(person.sequence())
-    assert dominant_actions(demo) == [0, 1, 2, 3]
-
-
-def test_limbs_have_their_surfaces():
-    limbs = [limb_of(s) for s in (*HANDS, *CRAWL, *FEET)]
-    assert limbs == ["LArm", "RArm"] * 2 + ["LLeg", "RLeg"] * 2
+        instead.put(s, "table", 0.5, leaves=s[0] + "Elbow")
+    for person, ruling in (
+        (before, [0, 1, 3]),
+        (after, [0, 2]),
+        (instead, [0, 1, 2, 3]),
+    ):
+        assert dominant_actions(build_demo_policy(person.sequence())) == ruling
 
 
 # The general policy of one demonstration.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.steps import SAME_PLACE, Step, split_moves
+from clamber.contact.steps import SAME_PLACE, split_moves
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World, build_world
@@ -64,84 +64,122 @@ def moves(world: World, *stances: str | list[Contact]) -> list[str]:
     return [f"{s.stance}: {s}" for s in steps]
 
 
-def skipped(world: World, *stances: str | list[Contact]) -> list[str]:
-    _, out = split_moves(sequence(*stances), world)
-    return [f"{s.stance}: {s.reason}" for s in out]
+SPLIT = {
+    "a whole climb, limb by limb": (
+        (
+            "LFoot RFoot",
+            "LFoot RFoot LHand",
+            "LFoot RFoot LHand RHand",
+            "LFoot RFoot LElbow RHand",
+            "LFoot RFoot LElbow RElbow",
+            "LKnee RFoot LElbow RElbow",
+            "LKnee RKnee LElbow RElbow",
+        ),
+        [
+            "1: air -> LHand on box",
+            "2: air -> RHand on box",
+            "3: LHand -> LElbow on box",
+            "4: RHand -> RElbow on box",
+            "5: LFoot -> LKnee on box",
+            "6: RFoot -> RKnee on box",
+        ],
+    ),
+    "limbs that change at once move one after the other, arms first": (
+        ("LFoot RFoot", "LKnee RKnee LHand RHand"),
+        [
+            "1: air -> LHand on box",
+            "1: air -> RHand on box",
+            "1: LFoot -> LKnee on box",
+            "1: RFoot -> RKnee on box",
+        ],
+    ),
+    "a leg in the air, part of its next move": (
+        ("LFoot RFoot", "LFoot RFoot LHand", "RFoot LHand", "LKnee RFoot LHand"),
+        ["1: air -> LHand on box", "3: LFoot -> LKnee on box"],
+    ),
+    "a leg in the air while another limb moves": (
+        ("LFoot RFoot", "RFoot LHand", "LKnee RFoot LHand"),
+        ["1: air -> LHand on box", "2: LFoot -> LKnee on box"],
+    ),
+    "of two surfaces of an arm the elbow bears; that the hand leaves is nothing": (
+        (
+            "LFoot RFoot",
+            "LFoot RFoot LHand",
+            "LFoot RFoot LHand LElbow",
+            "LFoot RFoot LElbow",
+        ),
+        ["1: air -> LHand on box", "2: LHand -> LElbow on box"],
+    ),
+    "of a shank that lies flat the knee bears": (
+        (
+            "LFoot RFoot LHand",
+            [
+                contact("LFoot", dx=0.3, support="box"),
+                *map(contact, ("LKnee", "RFoot", "LHand")),
+            ],
+        ),
+        ["1: air -> LHand on box", "1: LFoot -> LKnee on box"],
+    ),
+    "small shifts add up": (
+        (
+            "LFoot RFoot",
+            *(
+                [contact("LFoot"), contact("RFoot"), contact("LHand", 0.02 * i)]
+                for i in range(4)
+            ),
+        ),
+        ["1: air -> LHand on box", "3: LHand -> LHand on box"],
+    ),
+    "the same place on another support": (
+        ("LFoot RFoot", [contact("LFoot", support="box"), contact("RFoot")]),
+        ["1: LFoot -> LFoot on box"],
+    ),
+    "not made again, broken": (
+        ("LFoot RFoot", "LFoot RFoot LHand", "LFoot RFoot"),
+        ["1: air -> LHand on box", "2: LHand -> air"],
+    ),
+    "begun in mid-step: the foot that lands is down already": (
+        ("LFoot", "LFoot RFoot", "LFoot RFoot LHand"),
+        ["2: air -> LHand on box"],
+    ),
+    "begun on the hands: the robot stands all the same": (
+        ("LHand RHand", "LHand RHand LKnee"),
+        [
+            "1: air -> LHand on box",
+            "1: air -> RHand on box",
+            "1: LFoot -> LKnee on box",
+            "1: RFoot -> air",
+        ],
+    ),
+}
 
 
-def test_a_whole_climb_is_split_limb_by_limb(world):
-    assert moves(
-        world,
-        "LFoot RFoot",
-        "LFoot RFoot LHand",
-        "LFoot RFoot LHand RHand",
-        "LFoot RFoot LElbow RHand",
-        "LFoot RFoot LElbow RElbow",
-        "LKnee RFoot LElbow RElbow",
-        "LKnee RKnee LElbow RElbow",
-    ) == [
-        "1: air -> LHand on box",
-        "2: air -> RHand on box",
-        "3: LHand -> LElbow on box",
-        "4: RHand -> RElbow on box",
-        "5: LFoot -> LKnee on box",
-        "6: RFoot -> RKnee on box",
-    ]
+@pytest.mark.parametrize("name", SPLIT)
+def test_stances_are_split_into_steps_of_one_limb(world, name):
+    stances, expected = SPLIT[name]
+    assert moves(world, *stances) == expected
 
 
-def test_a_knee_replaces_the_foot_of_its_leg(world):
-    (step,), _ = split_moves(sequence("LFoot RFoot", "LKnee RFoot"), world)
-    assert step.limb == "left_leg"
-    assert step.breaks == ("LFoot",)
-    assert step.makes is not None
-    assert step.makes.surface == "LKnee"
-    assert not step.fixed
-    np.testing.assert_array_equal(step.makes.position, [0.30, 0.09, 0.275])
+def test_a_step_says_what_it_changes_and_where_it_leads(world):
+    demo = sequence("LFoot RFoot", "LKnee RFoot", "LKnee RFoot LHand", "RFoot LHand")
+    (knee, hand, air), passed = split_moves(demo, world)
+    assert not passed
+    assert (knee.limb, knee.breaks, knee.fixed) == ("left_leg", ("LFoot",), False)
+    assert knee.makes is demo.stances[1].contact("LKnee")
+    assert (air.breaks, air.makes) == (("LKnee",), None)
+    assert [s.stance for s in (knee, hand, air)] == [1, 2, 3]
+    assert all(s.target is demo.stances[s.stance] for s in (knee, hand, air))
 
 
-def test_limbs_that_change_at_once_move_one_after_the_other_arms_first(world):
-    assert moves(world, "LFoot RFoot", "LKnee RKnee LHand RHand") == [
-        "1: air -> LHand on box",
-        "1: air -> RHand on box",
-        "1: LFoot -> LKnee on box",
-        "1: RFoot -> RKnee on box",
-    ]
-
-
-def test_a_leg_in_the_air_is_part_of_its_next_move(world):
-    stances = ("LFoot RFoot LHand", "RFoot LHand", "LKnee RFoot LHand")
-    assert moves(world, "LFoot RFoot", *stances) == [
-        "1: air -> LHand on box",
-        "3: LFoot -> LKnee on box",
-    ]
-    (reason,) = skipped(world, "LFoot RFoot", *stances)
-    assert reason == "2: left leg in the air: part of its next move"
-
-
-def test_a_stance_with_another_move_is_not_skipped_for_the_leg_in_the_air(world):
-    stances = ("LFoot RFoot", "RFoot LHand", "LKnee RFoot LHand")
-    assert moves(world, *stances) == [
-        "1: air -> LHand on box",
-        "2: LFoot -> LKnee on box",
-    ]
-    assert skipped(world, *stances) == []
-
-
-def test_of_two_surfaces_of_an_arm_the_elbow_bears_the_load(world):
-    stances = ("LFoot RFoot LHand", "LFoot RFoot LHand LElbow", "LFoot RFoot LElbow")
-    assert moves(world, "LFoot RFoot", *stances) == [
-        "1: air -> LHand on box",
-        "2: LHand -> LElbow on box",
-    ]
-    # That the hand leaves later changes nothing that bears load.
-    (reason,) = skipped(world, "LFoot RFoot", *stances)
-    assert reason == "3: no limb makes or leaves a bearing contact"
-
-
-def test_of_a_shank_that_lies_flat_the_knee_bears_the_load(world):
-    toes = contact("LFoot", dx=0.3, support="box")
-    shank = [toes, contact("LKnee"), contact("RFoot"), contact("LHand")]
-    assert moves(world, "LFoot RFoot LHand", shank)[-1] == "1: LFoot -> LKnee on box"
+def test_a_stance_that_is_no_keyframe_is_skipped_and_says_why(world):
+    air = ("LFoot RFoot", "LFoot RFoot LHand", "RFoot LHand", "LKnee RFoot LHand")
+    hand = ("LFoot RFoot", "LFoot RFoot LHand LElbow", "LFoot RFoot LElbow")
+    for stances, reason in (
+        (air, "left leg in the air: part of its next move"),
+        (hand, "no limb makes or leaves a bearing contact"),
+    ):
+        (skipped,) = split_moves(sequence(*stances), world)[1]
+        assert (skipped.stance, skipped.reason) == (2, reason)
 
 
 @pytest.mark.parametrize(
@@ -154,51 +192,6 @@ def test_a_contact_made_again_in_the_same_place_has_not_moved(world, dx, moved):
         world, "LFoot RFoot", "LFoot RFoot LHand", "LFoot RFoot", again, "LFoot LHand"
     )
     assert ("3: LHand -> LHand on box" in found) == moved
-
-
-def test_small_shifts_add_up(world):
-    """Each is near the last, yet they lead away from where the hand is."""
-    stances = [
-        [contact("LFoot"), contact("RFoot"), contact("LHand", 0.02 * i)]
-        for i in range(4)
-    ]
-    assert moves(world, "LFoot RFoot", *stances) == [
-        "1: air -> LHand on box",
-        "3: LHand -> LHand on box",
-    ]
-
-
-def test_the_same_place_on_another_support_is_a_move(world):
-    step_up = [contact("LFoot", support="box"), contact("RFoot")]
-    assert moves(world, "LFoot RFoot", step_up) == ["1: LFoot -> LFoot on box"]
-
-
-def test_a_contact_that_is_not_made_again_is_broken(world):
-    stances = ("LFoot RFoot", "LFoot RFoot LHand", "LFoot RFoot")
-    assert moves(world, *stances) == ["1: air -> LHand on box", "2: LHand -> air"]
-    (_, last), _ = split_moves(sequence(*stances), world)
-    assert last.makes is None
-    assert last.breaks == ("LHand",)
-
-
-def test_the_robot_stands_on_both_feet_wherever_the_recording_begins(world):
-    """A recording that begins in mid-step: the foot that lands is down already."""
-    assert moves(world, "LFoot", "LFoot RFoot", "LFoot RFoot LHand") == [
-        "2: air -> LHand on box"
-    ]
-    assert moves(world, "LHand RHand", "LHand RHand LKnee") == [
-        "1: air -> LHand on box",
-        "1: air -> RHand on box",
-        "1: LFoot -> LKnee on box",
-        "1: RFoot -> air",
-    ]
-
-
-def test_each_step_knows_the_stance_it_leads_to(world):
-    demo = sequence("LFoot RFoot", "LFoot RFoot LHand", "LKnee RFoot LHand")
-    steps, _ = split_moves(demo, world)
-    assert [s.stance for s in steps] == [1, 2]
-    assert all(s.target is demo.stances[s.stance] for s in steps)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -240,12 +233,3 @@ def test_a_step_that_ends_on_the_feet_rises_if_it_is_the_last(world, last, stand
     stances = ("LFoot RFoot", "LHand RHand LFoot RFoot", "RHand LFoot RFoot", last)
     steps = split_moves(sequence(*stances), world)[0]
     assert [s.stands_up for s in steps] == [False] * (len(steps) - 1) + [stands_up]
-
-
-def test_a_move_says_what_it_does():
-    step = Step(limb="left_arm", breaks=("LHand",), makes=contact("LElbow"))
-    assert str(step) == "LHand -> LElbow on box"
-    assert str(Step(limb="left_arm", breaks=(), makes=contact("LHand"))).startswith(
-        "air"
-    )
-    assert str(Step(limb="left_arm", breaks=("LHand",), makes=None)) == "LHand -> air"

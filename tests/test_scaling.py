@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.scaling import limb_scales, near_edge, retarget
+from clamber.contact.scaling import limb_scales, retarget
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics, limb_lengths
 from clamber.model.robot import load_robot
@@ -78,63 +78,6 @@ def climb(scene: Scene | None = None, subject=PERSON) -> ContactSequence:
         Stance(contacts=(left, right, knee, contact("RFoot", GROUND, 0.2, -0.1))),
         subject=subject,
     )
-
-
-# The near edge.
-
-
-def test_the_edge_before_the_start_is_the_near_one():
-    e = near_edge(box().top, np.zeros(2))
-    np.testing.assert_allclose(e.origin, [0.4, 0.0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(e.rotation, np.eye(3), atol=1e-12)
-
-
-def test_its_origin_is_abreast_of_the_start():
-    e = near_edge(box().top, np.array([-0.3, 0.35]))
-    np.testing.assert_allclose(e.origin, [0.4, 0.35, 0.5], atol=1e-12)
-    beyond = near_edge(box().top, np.array([0.0, 0.9]))  # past the corner
-    np.testing.assert_allclose(beyond.origin, [0.4, 0.6, 0.5], atol=1e-12)
-
-
-@pytest.mark.parametrize("start", [(0.0, 0.1), (0.9, 2.0), (3.0, 0.2), (0.8, -1.5)])
-def test_it_is_the_nearest_point_of_the_border_from_any_side(start):
-    top = box().top
-    e = near_edge(top, np.array(start))
-    rim = np.array(start).clip([0.4, -0.6], [1.4, 0.6])
-    np.testing.assert_allclose(e.origin[:2], rim, atol=1e-12)
-    inward = e.rotation[:, 0]
-    assert inward @ (top.position - e.origin) > 0
-    assert top.inside(e.origin + 1e-6 * inward)
-    assert not top.inside(e.origin - 1e-6 * inward)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_the_edge_turns_with_box_and_start(seed):
-    rng = np.random.default_rng(seed)
-    yaw, shift = rng.uniform(-3, 3), rng.uniform(-2, 2, 2)
-    size = rng.uniform(0.4, 1.5, 3)
-    start = np.array([-0.4, rng.uniform(-0.2, 0.2)])
-    R = matrix_from_rpy([0.0, 0.0, yaw])
-    there = near_edge(box(0.2, size, (1.0, 0.0)).top, start)
-    at = (R[:2, :2] @ [1.0, 0.0]) + shift
-    here = near_edge(box(0.2 + yaw, size, at).top, R[:2, :2] @ start + shift)
-    np.testing.assert_allclose(here.rotation, R @ there.rotation, atol=1e-12)
-    np.testing.assert_allclose(here.origin, R @ there.origin + [*shift, 0], atol=1e-12)
-    np.testing.assert_allclose(here.rotation[:, 2], UP, atol=1e-15)
-    assert np.linalg.det(here.rotation) == pytest.approx(1.0)
-
-
-def test_the_edge_of_a_tilted_box_is_level_and_lies_on_the_top():
-    top = box(rp=(0.1, -0.2)).top
-    e = near_edge(top, np.array([-0.2, 0.05]))
-    assert top.height(e.origin) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(e.rotation[2], [0.0, 0.0, 1.0])
-
-
-def test_there_and_back_is_where_it_was():
-    e = near_edge(box(0.4).top, np.zeros(2))
-    p = np.array([0.7, -0.2, 0.9])
-    np.testing.assert_allclose(e.to_world(e.to_local(p)), p, atol=1e-15)
 
 
 # Scales.

@@ -19,6 +19,13 @@ from clamber.model.scene import GROUND, Scene
 Region = Literal["G", "M", "O"]
 # Surfaces of a person: each side has a hand, an elbow, a knee and a foot.
 PARTS = tuple(s + p for p in ("Hand", "Elbow", "Knee", "Foot") for s in "LR")
+# The limb of each, by the names that limbs of robots have.
+LIMBS = {
+    s + p: f"{side}_{limb}"
+    for s, side in (("L", "left"), ("R", "right"))
+    for limb, parts in (("arm", ("Hand", "Elbow")), ("leg", ("Foot", "Knee")))
+    for p in parts
+}
 DIRECTIONS = (
     "trunk",
     "left_upper_arm",

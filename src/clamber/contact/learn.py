@@ -16,7 +16,14 @@ from statistics import median
 
 import numpy as np
 
-from clamber.contact.contact import PARTS, Contact, ContactSequence, Region, Stance
+from clamber.contact.contact import (
+    LIMBS,
+    PARTS,
+    Contact,
+    ContactSequence,
+    Region,
+    Stance,
+)
 from clamber.contact.policy import (
     DemoPolicy,
     GeneralPolicy,
@@ -38,7 +45,7 @@ _INNER = {  # where both are down, the surface nearer to the trunk bears the loa
     for s in ("L", "R")
     for outer, inner in (("Hand", "Elbow"), ("Foot", "Knee"))
 }
-_SEGMENTS = {"Arm": ("upper_arm", "forearm"), "Leg": ("thigh", "shank")}
+_SEGMENTS = {"arm": ("upper_arm", "forearm"), "leg": ("thigh", "shank")}
 
 
 def learn_policy(sequences: Sequence[ContactSequence]) -> GeneralPolicy:
@@ -79,15 +86,14 @@ def build_demo_policy(sequence: ContactSequence) -> DemoPolicy:
         )
     states: list[Stance] = [sequence.stances[0]]
     actions: list[str | None] = []
-    last: dict[
-        str, dict[str, Contact]
-    ] = {}  # of each limb, while it held on to anything
+    # Contacts of each limb while it held on to anything.
+    last: dict[str, dict[str, Contact]] = {}
 
     def leave(stance: Stance, limbs: set[str]) -> None:
         """Give up what no longer holds, but for limbs that are about to act."""
         held = states[-1].contacts
         kept = tuple(
-            c for c in held if stance.contact(c.surface) or limb_of(c.surface) in limbs
+            c for c in held if stance.contact(c.surface) or _limb(c.surface) in limbs
         )
         if len(kept) < len(held):
             states.append(replace(stance, contacts=kept))
@@ -97,15 +103,15 @@ def build_demo_policy(sequence: ContactSequence) -> DemoPolicy:
         previous = sequence.stances[max(i - 1, 0)]
         acting = _acting(stance, previous, last) if i else []
         if acting:
-            leave(previous, {limb_of(n) for n in acting})
+            leave(previous, {_limb(n) for n in acting})
         for k, surface in enumerate(acting):
             later = acting[k + 1 :]  # touch in the same instant: one after the other
             now = tuple(c for c in stance.contacts if c.surface not in later)
             states.append(replace(stance, contacts=now))
             actions.append(surface)
-        for limb in {limb_of(n) for n in stance.surfaces}:
+        for limb in {_limb(n) for n in stance.surfaces}:
             last[limb] = {
-                c.surface: c for c in stance.contacts if limb_of(c.surface) == limb
+                c.surface: c for c in stance.contacts if _limb(c.surface) == limb
             }
     leave(sequence.stances[-1], set())
     return DemoPolicy(
@@ -117,9 +123,9 @@ def build_demo_policy(sequence: ContactSequence) -> DemoPolicy:
     )
 
 
-def limb_of(surface: str) -> str:
-    """Such as `LArm` of `LElbow`."""
-    return surface[0] + ("Arm" if surface[1:] in ("Hand", "Elbow") else "Leg")
+def _limb(surface: str) -> str:
+    """The limb of a surface; what is none of `PARTS` is one of its own."""
+    return LIMBS.get(surface, surface)
 
 
 def _acting(
@@ -127,7 +133,7 @@ def _acting(
 ) -> list[str]:
     """Surfaces whose actions lead to a stance."""
     moved = {
-        c.surface: _moved(c, last.get(limb_of(c.surface), {}).get(c.surface))
+        c.surface: _moved(c, last.get(_limb(c.surface), {}).get(c.surface))
         for c in stance.contacts
     }
     far = {n: d for n, d in moved.items() if d > SAME_PLACE}
@@ -217,7 +223,7 @@ def _dominant(demo: DemoPolicy) -> list[_Action]:
 
 def _same_limb(demo: DemoPolicy, i: int, surface: str) -> bool:
     action = demo.actions[i]
-    return action is not None and limb_of(action) == limb_of(surface)
+    return action is not None and _limb(action) == _limb(surface)
 
 
 def find_cycles(names: Sequence[str], *, first: int = 0) -> tuple[int, int, int] | None:
@@ -455,15 +461,15 @@ def _reach(demos: Sequence[DemoPolicy], surfaces: set[str]) -> dict[str, float]:
     """
     out: dict[str, float] = {}
     for demo in demos:
-        bearing = {limb_of(c.surface): c for c in demo.states[0].contacts}
+        bearing = {_limb(c.surface): c for c in demo.states[0].contacts}
         for action in _dominant(demo):
-            limb = limb_of(action.surface)
+            limb = _limb(action.surface)
             was, now = bearing.get(limb), action.makes
             bearing[limb] = now
             if was is None or was.surface != now.surface or now.surface not in surfaces:
                 continue
             step = _moved(now, was)
             if SAME_PLACE < step < math.inf:
-                length = sum(demo.subject[x] for x in _SEGMENTS[limb[1:]])
+                length = sum(demo.subject[x] for x in _SEGMENTS[limb.split("_")[1]])
                 out[now.surface] = max(out.get(now.surface, 0.0), step / length)
     return {n: out[n] for n in PARTS if n in out}

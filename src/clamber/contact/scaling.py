@@ -11,52 +11,16 @@ obstacle, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics, limb_lengths
-from clamber.model.records import short_repr
-from clamber.model.scene import GROUND, Support
+from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat, quat_from_matrix
 from clamber.model.world import World
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _Edge:
-    origin: np.ndarray
-    rotation: np.ndarray  # R_WE
-
-    __repr__ = short_repr
-
-    def to_local(self, p: np.ndarray) -> np.ndarray:
-        return self.rotation.T @ (p - self.origin)
-
-    def to_world(self, p: np.ndarray) -> np.ndarray:
-        return self.origin + self.rotation @ p
-
-
-def near_edge(support: Support, start: np.ndarray) -> _Edge:
-    """The edge frame of a support seen from `start` (x, y)."""
-    corners = support.position + support.polygon @ support.rotation[:, :2].T
-    best = None
-    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        along = (b - a)[:2]
-        along = along / np.linalg.norm(along)
-        inward = np.array([-along[1], along[0]])  # ccw polygon: inside lies to the left
-        ahead = float((a[:2] - start) @ inward)
-        s = float(np.clip((start - a[:2]) @ along, 0.0, np.linalg.norm((b - a)[:2])))
-        foot = a[:2] + s * along
-        score = (float(np.linalg.norm(foot - start)), -ahead)
-        if best is None or score < best[0]:
-            z = a[2] + (b[2] - a[2]) * s / max(np.linalg.norm((b - a)[:2]), 1e-9)
-            best = (score, np.array([foot[0], foot[1], z]), inward)
-    assert best is not None
-    x = np.array([best[2][0], best[2][1], 0.0])
-    R = np.stack([x, np.array([-x[1], x[0], 0.0]), [0.0, 0.0, 1.0]], axis=1)
-    return _Edge(origin=best[1], rotation=R)
 
 
 def limb_scales(subject: dict[str, float] | None, kin: Kinematics) -> dict[str, float]:
@@ -119,8 +83,8 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
     there_start, here_start = _ground_start(sequence), world.scene.start[:2]
     edges = {
         a: (
-            near_edge(sequence.scene.support(a), there_start),
-            near_edge(world.supports[b], here_start),
+            sequence.scene.support(a).edge_towards(there_start),
+            world.supports[b].edge_towards(here_start),
         )
         for a, b in names.items()
     }
@@ -146,10 +110,8 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
         else:
             there, here = edges[c.support]
             support = names[c.support]
-            local = there.to_local(c.position)
-            position = here.to_world(
-                np.array([scale * local[0], scale * local[1], 0.0])
-            )
+            x, y, _ = there.rotation.T @ (c.position - there.point)
+            position = here.point + here.rotation @ np.array([scale * x, scale * y, 0])
             s = world.supports[support]
             position = position - s.normal * s.height(position)
         R = turn @ matrix_from_quat(c.quaternion)

@@ -27,7 +27,6 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Region, Stance, region_of
 from clamber.contact.policy import GeneralPolicy
-from clamber.contact.scaling import near_edge
 from clamber.contact.steps import Step, on_feet, split_moves
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics
@@ -296,7 +295,7 @@ class _Guidance:
             name: quat_from_matrix(
                 np.eye(3)
                 if name == GROUND
-                else near_edge(support, world.scene.start[:2]).rotation
+                else support.edge_towards(world.scene.start[:2]).rotation
             )
             for name, support in world.supports.items()
         }
