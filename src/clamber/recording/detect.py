@@ -125,6 +125,7 @@ class _Tracks:
     options: DetectOptions
     position: np.ndarray  # (T, F, 3) [m]
     speeds: np.ndarray  # (T, F) [m/s]
+    noise: dict[str, float]  # of each point [m]
 
     __repr__ = short_repr
 
@@ -210,7 +211,9 @@ def _smooth(demo: Demonstration, scene: Scene, options: DetectOptions) -> _Track
     n, short = samples(options.smoothing), samples(options.smoothing / 2)
     velocity = np.asarray(savgol_filter(p, n, 2, deriv=1, delta=dt, axis=0))
     position = np.asarray(savgol_filter(p, short, 2, axis=0))
-    return _Tracks(demo, scene, options, position, np.linalg.norm(velocity, axis=2))
+    speeds = np.linalg.norm(velocity, axis=2)
+    noise = {n: noise_of(demo.point(n)) for n in demo.names}
+    return _Tracks(demo, scene, options, position, speeds, noise)
 
 
 def _evidence(demo: Demonstration) -> list[str]:
@@ -458,7 +461,7 @@ def _refine(
     around = tracks.samples(_AROUND)
     ahead = min(i + tracks.samples(_SEARCH), (i + j) // 2)
     resting = support.height(raw)[ahead : min(ahead + tracks.samples(_REST), j)]
-    still = max(_STILL, _SIGMAS * noise_of(raw) / 2.0)  # smoothing halves the noise
+    still = max(_STILL, _SIGMAS * tracks.noise[point] / 2)  # smoothing halves the noise
     start = max(i - around, 0)
     # No part rests above its place.
     away = support.height(smooth)[start : ahead + 1] - np.median(resting) > still
