@@ -21,8 +21,9 @@ from clamber.errors import InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
+from clamber.planning.trajectory import Trajectory
 from clamber.run import export
-from clamber.run import folder as io
+from clamber.run.folder import save_plan, save_rollout
 
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
@@ -38,17 +39,23 @@ def rollout(one_hand_rollout: Rollout) -> Rollout:
 
 
 @pytest.fixture(scope="module")
+def t(plan: Plan) -> Trajectory:
+    assert plan.trajectory is not None
+    return plan.trajectory
+
+
+@pytest.fixture(scope="module")
 def planned(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("planned")
-    io.save_plan(plan, folder)
+    save_plan(plan, folder)
     return folder
 
 
 @pytest.fixture(scope="module")
 def run(plan: Plan, rollout: Rollout, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    io.save_plan(plan, folder)
-    io.save_rollout(plan, rollout, folder)
+    save_plan(plan, folder)
+    save_rollout(plan, rollout, folder)
     return folder
 
 
@@ -62,12 +69,11 @@ def home(plan: Plan) -> dict[str, float]:
 
 
 def test_a_csv_has_every_number_of_the_run_by_name_and_unit(
-    plan: Plan, rollout: Rollout, run: Path, tmp_path: Path
+    t: Trajectory, plan: Plan, rollout: Rollout, run: Path, tmp_path: Path
 ):
     done = clamber.export_run(run, to="csv", out=tmp_path / "a.csv")
     table = pandas.read_csv(done.file)
-    t, w = plan.trajectory, plan.world
-    assert t is not None
+    w = plan.world
     k = np.arange(0, len(t.time), 10)  # 100 Hz
     assert len(table) == done.samples == len(k)
     assert not table.isna().any().any()
@@ -86,16 +92,6 @@ def test_a_csv_has_every_number_of_the_run_by_name_and_unit(
     assert np.array_equal(table[[f"base q{a} [-]" for a in "wxyz"]], t.q[k, 3:7])
     assert np.array_equal(table[[f"base v{a} [m/s]" for a in "xyz"]], t.v[k, :3])
     assert np.array_equal(table[[f"base w{a} [rad/s]" for a in "xyz"]], t.v[k, 3:6])
-
-
-def test_forces_are_held_between_the_recorded_states(
-    rollout: Rollout, run: Path, tmp_path: Path
-):
-    done = clamber.export_run(run, to="csv", out=tmp_path / "a.csv", rate=500)
-    table = pandas.read_csv(done.file)
-    z = table["LFoot force z [N]"].to_numpy()
-    held = np.repeat(rollout.contact_force[:, rollout.surfaces.index("LFoot"), 2], 5)
-    assert np.allclose(z, held[: len(z)], rtol=1e-14)
 
 
 def test_a_plan_that_was_not_simulated_has_no_forces(planned: Path, tmp_path: Path):
@@ -123,12 +119,12 @@ def test_a_run_that_fell_ends_where_it_fell(plan: Plan, rollout: Rollout, tmp_pa
             )
         },
     )
-    io.save_plan(plan, tmp_path)
-    io.save_rollout(plan, fell, tmp_path)
+    save_plan(plan, tmp_path)
+    save_rollout(plan, fell, tmp_path)
     motion = export.load_motion(tmp_path, rate=1000)
     assert len(motion.reference.q) == n
-    assert motion.force is not None
-    assert np.array_equal(motion.force[-1], rollout.contact_force[kept - 1])
+    held = np.repeat(rollout.contact_force[:kept], rollout.stride, axis=0)
+    assert np.array_equal(motion.force, held[:n])  # between the recorded states
 
 
 # MCAP.
@@ -158,12 +154,11 @@ def seconds(stamp) -> float:
 
 @pytest.mark.parametrize("effort", [False, True])
 def test_the_joint_trajectory_is_one_message_with_the_same_numbers(
-    plan: Plan, topics: dict[str, list], effort: bool
+    t: Trajectory, plan: Plan, topics: dict[str, list], effort: bool
 ):
     topic = "/joint_trajectory" + "_with_torques" * effort
     ((schema, log_time, message),) = topics[topic]
-    t, w = plan.trajectory, plan.world
-    assert t is not None
+    w = plan.world
     assert schema == TRAJECTORY
     assert log_time == 0
     assert tuple(message.joint_names) == w.joints
@@ -184,11 +179,10 @@ def test_the_joint_trajectory_is_one_message_with_the_same_numbers(
 
 
 def test_cubic_splines_through_the_points_are_the_1_khz_trajectory(
-    plan: Plan, topics: dict[str, list]
+    t: Trajectory, plan: Plan, topics: dict[str, list]
 ):
     """What `joint_trajectory_controller` makes of positions and velocities."""
-    t, w = plan.trajectory, plan.world
-    assert t is not None
+    w = plan.world
     points = topics["/joint_trajectory"][0][2].points
     spline = CubicHermiteSpline(
         [seconds(p.time_from_start) for p in points],
@@ -201,11 +195,9 @@ def test_cubic_splines_through_the_points_are_the_1_khz_trajectory(
 
 
 def test_states_forces_and_contacts_are_those_of_the_run(
-    plan: Plan, rollout: Rollout, topics: dict[str, list]
+    t: Trajectory, plan: Plan, rollout: Rollout, topics: dict[str, list]
 ):
     w, m = plan.world, rollout.world.model
-    t = plan.trajectory
-    assert t is not None
     states = topics["/joint_states"]
     n = len(states)
     assert n == len(t.time[::10])
@@ -237,11 +229,12 @@ def test_states_forces_and_contacts_are_those_of_the_run(
     assert feet == pytest.approx(weight, rel=0.05)
 
 
-def test_without_a_rollout_the_reference_moves(plan: Plan, planned: Path, tmp_path):
+def test_without_a_rollout_the_reference_moves(
+    t: Trajectory, plan: Plan, planned: Path, tmp_path
+):
     done = clamber.export_run(planned, to="mcap", out=tmp_path / "a.mcap", rate=50)
     topics = messages(done.file)
-    t, w = plan.trajectory, plan.world
-    assert t is not None
+    w = plan.world
     states = [x.position for *_, x in topics["/joint_states"]]
     assert np.array_equal(states, t.q[::20][:, w.qadr])
     assert not [topic for topic in topics if topic.startswith("/force")]
@@ -290,12 +283,11 @@ def test_velocities_of_bodies_are_the_derivatives_of_their_poses(
 
 
 def test_an_npz_is_what_mjlab_reads(
-    plan: Plan, rollout: Rollout, run: Path, tmp_path: Path
+    t: Trajectory, plan: Plan, rollout: Rollout, run: Path, tmp_path: Path
 ):
     done = clamber.export_run(run, to="npz", out=tmp_path / "a.npz")
     f = np.load(done.file, allow_pickle=False)
-    t, w = plan.trajectory, plan.world
-    assert t is not None
+    w = plan.world
     n, na = len(t.time[::20]), len(w.joints)
     assert f["fps"].tolist() == [50]
     assert f["joint_pos"].shape == f["joint_vel"].shape == (n, na)
@@ -352,8 +344,8 @@ def test_a_base_that_execution_moved_gets_its_velocity_from_its_poses(
     """With contacts felt, what was followed has velocities of joints only."""
     felt = clamber.simulate(plan, controller="mixed")
     assert felt.followed is not None
-    io.save_plan(plan, tmp_path)
-    io.save_rollout(plan, felt, tmp_path)
+    save_plan(plan, tmp_path)
+    save_rollout(plan, felt, tmp_path)
     x = export.load_motion(tmp_path, rate=50).reference
     kin = Kinematics(plan.world)
     assert np.array_equal(x.q, felt.followed.q[::20])
@@ -530,7 +522,7 @@ def test_a_folder_without_a_plan_or_without_a_trajectory_is_refused(
 ):
     with pytest.raises(InputError, match=r"plan\.json"):
         clamber.export_run(tmp_path, to="csv")
-    io.save_plan(replace(plan, trajectory=None, complete=False), tmp_path)
+    save_plan(replace(plan, trajectory=None, complete=False), tmp_path)
     with pytest.raises(InputError, match="as far as a trajectory"):
         clamber.export_run(tmp_path, to="csv")
 

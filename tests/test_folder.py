@@ -27,7 +27,28 @@ from clamber.model.robot import ROBOTS
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.planning.records import Plan
-from clamber.run import folder as io
+from clamber.run.folder import (
+    EXECUTION,
+    PLAN,
+    PLANNED_SCENE,
+    PLANNED_TRAJECTORY,
+    ROLLOUT,
+    SCENE,
+    SEQUENCE,
+    TIMINGS,
+    TRAJECTORY,
+    load_plan,
+    load_rollout,
+    load_sequence,
+    load_trajectory,
+    load_verdict,
+    new_run_folder,
+    save_plan,
+    save_rollout,
+    save_sequence,
+    save_timings,
+    save_verdict,
+)
 from clamber.step.change import Failure
 from records import differences, same
 
@@ -50,8 +71,8 @@ def rollout(one_hand_rollout: Rollout) -> Rollout:
 @pytest.fixture(scope="module")
 def saved(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
-    io.save_sequence(plan.sequence, folder / io.SEQUENCE)
-    io.save_plan(plan, folder)
+    save_sequence(plan.sequence, folder / SEQUENCE)
+    save_plan(plan, folder)
     return folder
 
 
@@ -62,7 +83,7 @@ def copied(saved: Path, tmp_path: Path) -> Path:
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
     files = (p for p in sorted(folder.rglob("*")) if p.is_file())
-    return {p.name: p.read_bytes() for p in files if p.name != io.TIMINGS}
+    return {p.name: p.read_bytes() for p in files if p.name != TIMINGS}
 
 
 # Folders.
@@ -72,15 +93,15 @@ def test_run_folders_are_numbered_when_the_name_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
-    made = [io.new_run_folder(None, "climb") for _ in range(3)]
+    made = [new_run_folder(None, "climb") for _ in range(3)]
     assert [str(p) for p in made] == ["runs/climb", "runs/climb-2", "runs/climb-3"]
-    assert str(io.new_run_folder(None, "plan")) == "runs/plan"
+    assert str(new_run_folder(None, "plan")) == "runs/plan"
 
 
 def test_a_folder_that_is_asked_for_may_exist_and_may_be_deep(tmp_path: Path):
     deep = tmp_path / "a" / "b"
-    assert io.new_run_folder(deep, "climb") == deep
-    assert io.new_run_folder(deep, "climb") == deep
+    assert new_run_folder(deep, "climb") == deep
+    assert new_run_folder(deep, "climb") == deep
     assert list(deep.iterdir()) == []
 
 
@@ -93,14 +114,14 @@ def test_a_folder_that_cannot_be_made_is_named_with_the_flag(
     with pytest.raises(
         InputError, match=r"--out is '.*taken.*; expected a folder that"
     ):
-        io.new_run_folder(taken / "below" if inside else taken, "climb")
+        new_run_folder(taken / "below" if inside else taken, "climb")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_without_permission_to_write_is_refused(tmp_path: Path):
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match="Permission denied"):
-        io.new_run_folder(tmp_path / "run", "climb")
+        new_run_folder(tmp_path / "run", "climb")
 
 
 # Sequences.
@@ -111,16 +132,16 @@ def test_a_sequence_survives_the_disk_to_the_last_bit(
 ):
     third = replace(one_hand, scene=Scene.from_height(1 / 3))
     sequence = replace(third, subject={"thigh": 0.1 + 0.2}, source="\u00dcbung")
-    io.save_sequence(sequence, tmp_path / io.SEQUENCE)
-    for path in (tmp_path, tmp_path / io.SEQUENCE):
-        assert not list(differences(io.load_sequence(path), sequence))
+    save_sequence(sequence, tmp_path / SEQUENCE)
+    for path in (tmp_path, tmp_path / SEQUENCE):
+        assert not list(differences(load_sequence(path), sequence))
 
 
 def test_a_sequence_of_version_1_is_read(one_hand: ContactSequence, tmp_path: Path):
-    path = tmp_path / io.SEQUENCE
-    io.save_sequence(one_hand, path)
+    path = tmp_path / SEQUENCE
+    save_sequence(one_hand, path)
     edit(path, lambda c: c.update(version=1))
-    assert same(io.load_sequence(path), one_hand)
+    assert same(load_sequence(path), one_hand)
 
 
 @pytest.mark.parametrize(
@@ -142,8 +163,8 @@ def test_a_turned_and_raised_box_survives_the_disk(
         start=np.array([0.1, 0.2, 0.3]),
         goal=np.array([2.0, 0.0]),
     )
-    io.save_sequence(replace(one_hand, scene=scene), tmp_path / "s.json")
-    back = io.load_sequence(tmp_path / "s.json").scene
+    save_sequence(replace(one_hand, scene=scene), tmp_path / "s.json")
+    back = load_sequence(tmp_path / "s.json").scene
     np.testing.assert_allclose(back.boxes[1].position, box.position, atol=1e-15)
     np.testing.assert_allclose(back.boxes[1].rotation, box.rotation, atol=1e-15)
     exact = np.array_equal(back.boxes[1].rotation, box.rotation)
@@ -153,7 +174,7 @@ def test_a_turned_and_raised_box_survives_the_disk(
 
 
 def test_a_stance_says_its_region_and_times(one_hand: ContactSequence, tmp_path: Path):
-    io.save_sequence(one_hand, tmp_path / "s.json")
+    save_sequence(one_hand, tmp_path / "s.json")
     content = json.loads((tmp_path / "s.json").read_text())
     assert content["version"] == 2
     assert [s["region"] for s in content["stances"]] == ["G", "M"]
@@ -193,10 +214,10 @@ def test_a_mistake_in_a_sequence_is_named_with_its_file_and_field(
     tmp_path: Path,
 ):
     path = tmp_path / "s.json"
-    io.save_sequence(one_hand, path)
+    save_sequence(one_hand, path)
     edit(path, change)
     with pytest.raises(InputError) as e:
-        io.load_sequence(path)
+        load_sequence(path)
     assert (e.value.source, e.value.field) == (path, field)
     assert "\n" not in str(e.value)
 
@@ -207,19 +228,19 @@ def test_a_mistake_in_a_sequence_is_named_with_its_file_and_field(
 def test_a_loaded_plan_is_the_one_that_was_made(plan: Plan, saved: Path):
     assert plan.complete
     assert len(plan.changes) == 1
-    assert not list(differences(io.load_plan(saved), plan))
+    assert not list(differences(load_plan(saved), plan))
 
 
 def test_a_plan_is_saved_as_it_was_loaded(saved: Path, tmp_path: Path):
-    io.save_sequence(io.load_sequence(saved), tmp_path / io.SEQUENCE)
-    io.save_plan(io.load_plan(saved), tmp_path)
+    save_sequence(load_sequence(saved), tmp_path / SEQUENCE)
+    save_plan(load_plan(saved), tmp_path)
     assert bytes_of(tmp_path) == bytes_of(saved)
 
 
 def test_a_loaded_plan_is_run_planned_again_and_told_as_the_one_that_was_made(
     plan: Plan, saved: Path, rollout: Rollout
 ):
-    loaded = io.load_plan(saved)
+    loaded = load_plan(saved)
     again = clamber.simulate(loaded, controller="pid")
     assert not list(differences(again, rollout))
     assert plan_record(loaded) == plan_record(plan)
@@ -248,14 +269,14 @@ def test_two_runs_leave_the_same_bytes(
     again = clamber.plan(
         one_hand, clamber.load_robot("coman"), one_hand.scene, options=plan.options
     )
-    folder = io.new_run_folder(tmp_path / "a", "plan")
-    io.save_sequence(again.sequence, folder / io.SEQUENCE)
-    io.save_plan(again, folder)
+    folder = new_run_folder(tmp_path / "a", "plan")
+    save_sequence(again.sequence, folder / SEQUENCE)
+    save_plan(again, folder)
     assert bytes_of(folder) == bytes_of(saved)
     assert {p.name for p in saved.iterdir()} == PLAN_FILES
     for folder in ("b", "c"):
         shutil.copytree(saved, tmp_path / folder)
-        io.save_rollout(plan, rollout, tmp_path / folder)
+        save_rollout(plan, rollout, tmp_path / folder)
     assert bytes_of(tmp_path / "b") == bytes_of(tmp_path / "c")
 
 
@@ -282,7 +303,7 @@ def test_the_plan_names_what_it_was_made_of(plan: Plan, saved: Path):
     assert content["options"]["speed"] == 1.0
     assert content["versions"]["mujoco"] == mujoco.__version__
     assert set(content["inputs"]) == {"robot", "robot_model", "sequence"}
-    sequence = (saved / io.SEQUENCE).read_bytes()
+    sequence = (saved / SEQUENCE).read_bytes()
     assert content["inputs"]["sequence"] == hashlib.sha256(sequence).hexdigest()
     assert content["prefixes"]["LKnee"] == "LKnee"
     assert str(ROBOTS) not in (saved / "plan.json").read_text()
@@ -301,25 +322,25 @@ def test_the_plan_names_what_it_was_made_of(plan: Plan, saved: Path):
 
 def test_durations_are_in_one_file_alone(plan: Plan, copied: Path):
     before = bytes_of(copied)
-    io.save_plan(replace(plan, timings={"keyframes": 99.0}), copied)
+    save_plan(replace(plan, timings={"keyframes": 99.0}), copied)
     assert bytes_of(copied) == before
-    io.save_timings(copied, {"simulate": 2.0})
+    save_timings(copied, {"simulate": 2.0})
     content = json.loads((copied / "timings.json").read_text())
     assert content == {"version": 2, "seconds": {"keyframes": 99.0, "simulate": 2.0}}
-    assert io.load_plan(copied).timings == content["seconds"]
+    assert load_plan(copied).timings == content["seconds"]
 
 
 def test_results_of_an_earlier_plan_do_not_stay(
     plan: Plan, rollout: Rollout, tmp_path: Path
 ):
-    io.save_plan(plan, tmp_path)
-    io.save_rollout(plan, rollout, tmp_path)
-    io.save_verdict(Verdict(reached=True, criteria={}), tmp_path)
+    save_plan(plan, tmp_path)
+    save_rollout(plan, rollout, tmp_path)
+    save_verdict(Verdict(reached=True, criteria={}), tmp_path)
     nothing = replace(plan, trajectory=None, complete=False)
-    io.save_plan(nothing, tmp_path)
+    save_plan(nothing, tmp_path)
     left = {p.name for p in tmp_path.iterdir()}
-    assert left == {io.PLAN, io.PLANNED_SCENE, io.SCENE, io.TIMINGS}
-    assert same(io.load_plan(tmp_path), nothing)
+    assert left == {PLAN, PLANNED_SCENE, SCENE, TIMINGS}
+    assert same(load_plan(tmp_path), nothing)
 
 
 def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path):
@@ -332,9 +353,9 @@ def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path
     skipped = (Skipped(stance=4, reason="out of reach"),)
     failed = (Failure(status=Status.UNREACHABLE, step=plan.changes[0].step),)
     stuck = replace(plan, start=key, changes=(), skipped=skipped, failures=failed)
-    io.save_plan(stuck, tmp_path)
-    assert "Infinity" not in (tmp_path / io.PLAN).read_text()
-    assert same(io.load_plan(tmp_path), stuck)
+    save_plan(stuck, tmp_path)
+    assert "Infinity" not in (tmp_path / PLAN).read_text()
+    assert same(load_plan(tmp_path), stuck)
 
 
 @pytest.mark.parametrize(
@@ -356,17 +377,17 @@ def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path
 def test_a_mistake_in_a_plan_is_named(
     change: Callable[[dict], object], field: str, copied: Path
 ):
-    edit(copied / io.PLAN, change)
+    edit(copied / PLAN, change)
     with pytest.raises(InputError) as e:
-        io.load_plan(copied)
-    assert (e.value.source, e.value.field) == (copied / io.PLAN, field)
+        load_plan(copied)
+    assert (e.value.source, e.value.field) == (copied / PLAN, field)
     assert "\n" not in str(e.value)
 
 
 def test_a_plan_of_the_first_version_says_who_made_it(copied: Path):
-    edit(copied / io.PLAN, lambda c: c.update(version=1))
+    edit(copied / PLAN, lambda c: c.update(version=1))
     with pytest.raises(InputError, match=r"clamber 0\.1 .* `clamber plan` writes it"):
-        io.load_plan(copied)
+        load_plan(copied)
 
 
 @pytest.mark.parametrize(
@@ -380,25 +401,25 @@ def test_a_plan_of_the_first_version_says_who_made_it(copied: Path):
 def test_a_world_that_does_not_fit_the_plan_is_named(
     change: Callable[[str], str], copied: Path
 ):
-    path = copied / io.PLANNED_SCENE
+    path = copied / PLANNED_SCENE
     path.write_text(change(path.read_text()))
     with pytest.raises(InputError) as e:
-        io.load_plan(copied)
+        load_plan(copied)
     assert e.value.source == path
     assert "\n" not in str(e.value)
 
 
-@pytest.mark.parametrize("name", [io.PLAN, io.PLANNED_TRAJECTORY, io.PLANNED_SCENE])
+@pytest.mark.parametrize("name", [PLAN, PLANNED_TRAJECTORY, PLANNED_SCENE])
 def test_a_missing_file_of_a_plan_is_named(name: str, copied: Path):
     (copied / name).unlink()
     with pytest.raises(InputError) as e:
-        io.load_plan(copied)
+        load_plan(copied)
     assert e.value.source == copied / name
 
 
 def test_a_folder_that_is_none_is_named(tmp_path: Path):
     with pytest.raises(InputError, match="nowhere: expected a run folder"):
-        io.load_plan(tmp_path / "nowhere")
+        load_plan(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
@@ -413,11 +434,11 @@ def test_another_robots_trajectory_is_named(
     change: dict, field: str, plan: Plan, copied: Path
 ):
     path = copied / "other.npz"
-    with np.load(copied / io.TRAJECTORY) as f:
+    with np.load(copied / TRAJECTORY) as f:
         arrays = {**f, **change}
     np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
     with pytest.raises(InputError) as e:
-        io.load_trajectory(path, plan.world)
+        load_trajectory(path, plan.world)
     assert (e.value.source, e.value.field) == (path, field)
 
 
@@ -435,7 +456,7 @@ def test_meshes_travel_with_the_scene(plan: Plan, tmp_path: Path):
     robot = replace(plan.world.robot, path=tmp_path / "robot" / "robot.xml")
     out = tmp_path / "out"
     out.mkdir()
-    io.save_plan(replace(plan, world=replace(plan.world, xml=xml, robot=robot)), out)
+    save_plan(replace(plan, world=replace(plan.world, xml=xml, robot=robot)), out)
     for p in (source / "b" / "a.obj", source / "a.obj"):
         p.unlink()
     model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
@@ -449,8 +470,8 @@ def test_meshes_travel_with_the_scene(plan: Plan, tmp_path: Path):
 def test_a_rollout_survives_the_disk_to_the_last_bit(
     plan: Plan, rollout: Rollout, copied: Path
 ):
-    io.save_rollout(plan, rollout, copied)
-    assert not list(differences(io.load_rollout(copied), rollout))
+    save_rollout(plan, rollout, copied)
+    assert not list(differences(load_rollout(copied), rollout))
 
 
 def test_what_ran_and_what_was_planned_are_both_kept(plan: Plan, copied: Path):
@@ -460,26 +481,26 @@ def test_what_ran_and_what_was_planned_are_both_kept(plan: Plan, copied: Path):
     assert ran.followed is not None
     assert ran.events
     planned = bytes_of(copied)
-    io.save_rollout(plan, ran, copied)
+    save_rollout(plan, ran, copied)
     now = bytes_of(copied)
-    for name in (io.PLAN, io.PLANNED_SCENE, io.PLANNED_TRAJECTORY):
+    for name in (PLAN, PLANNED_SCENE, PLANNED_TRAJECTORY):
         assert now[name] == planned[name]
-    for name in (io.SCENE, io.TRAJECTORY):
+    for name in (SCENE, TRAJECTORY):
         assert now[name] != planned[name]
-    back = io.load_rollout(copied)
+    back = load_rollout(copied)
     assert back.world.xml == ran.world.xml
     assert same(replace(back, world=plan.world), replace(ran, world=plan.world))
     assert back.world.scene.boxes[0].size[2] == pytest.approx(0.25 - 0.02)
-    assert same(io.load_plan(copied), plan)
+    assert same(load_plan(copied), plan)
     # The next run, open loop in the planned world, leaves none of that behind.
-    io.save_rollout(plan, clamber.simulate(plan, controller="pid"), copied)
+    save_rollout(plan, clamber.simulate(plan, controller="pid"), copied)
     again = bytes_of(copied)
     assert {n: again[n] for n in planned} == planned
-    assert io.load_rollout(copied).followed is None
+    assert load_rollout(copied).followed is None
 
 
 def test_plain_mujoco_replays_the_rollout(plan: Plan, rollout: Rollout, copied: Path):
-    io.save_rollout(plan, rollout, copied)
+    save_rollout(plan, rollout, copied)
     model = mujoco.MjModel.from_xml_path(str(copied / "scene.xml"))
     data = mujoco.MjData(model)
     with np.load(copied / "rollout.npz", allow_pickle=False) as f:
@@ -496,27 +517,27 @@ def test_plain_mujoco_replays_the_rollout(plan: Plan, rollout: Rollout, copied: 
 def test_a_broken_rollout_is_named(plan: Plan, rollout: Rollout, copied: Path):
     def fault() -> tuple[object, str | None]:
         with pytest.raises(InputError) as e:
-            io.load_rollout(copied)
+            load_rollout(copied)
         return e.value.source, e.value.field
 
-    assert fault() == (copied / io.ROLLOUT, None)
-    io.save_rollout(plan, replace(rollout, qpos=rollout.qpos[1:]), copied)
-    assert fault() == (copied / io.ROLLOUT, "shape of qpos")
-    io.save_rollout(plan, rollout, copied)
-    (copied / io.TRAJECTORY).unlink()
-    assert fault() == (copied / io.TRAJECTORY, None)
-    (copied / io.EXECUTION).write_text('{"version": 2}')
-    assert fault() == (copied / io.EXECUTION, "scene")
+    assert fault() == (copied / ROLLOUT, None)
+    save_rollout(plan, replace(rollout, qpos=rollout.qpos[1:]), copied)
+    assert fault() == (copied / ROLLOUT, "shape of qpos")
+    save_rollout(plan, rollout, copied)
+    (copied / TRAJECTORY).unlink()
+    assert fault() == (copied / TRAJECTORY, None)
+    (copied / EXECUTION).write_text('{"version": 2}')
+    assert fault() == (copied / EXECUTION, "scene")
 
 
 def test_a_verdict_survives_the_disk(plan: Plan, rollout: Rollout, tmp_path: Path):
     verdict = clamber.judge(plan, rollout)
-    io.save_verdict(verdict, tmp_path)
-    assert same(io.load_verdict(tmp_path), verdict)
+    save_verdict(verdict, tmp_path)
+    assert same(load_verdict(tmp_path), verdict)
     content = json.loads((tmp_path / "verdict.json").read_text())
     assert content["reached"] == verdict.reached
     speed = content["criteria"]["pelvis speed at the end [m/s]"]
     assert set(speed) == {"value", "limit", "ok"}
     (tmp_path / "verdict.json").write_text('{"version": 2}')
     with pytest.raises(InputError, match="reached: expected a value"):
-        io.load_verdict(tmp_path)
+        load_verdict(tmp_path)
