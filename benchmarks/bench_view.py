@@ -64,8 +64,8 @@ def measure(
         tab.wait_for_selector("text=speed")
         tab.get_by_text("Show", exact=True).click()
         for name, on in layers.items():
-            row = tab.locator("label", has_text=name).first.locator("xpath=../../..")
-            row.locator("input").set_checked(on)
+            row = tab.get_by_text(name, exact=True).locator("xpath=../../..")
+            row.locator("input").first.set_checked(on, force=True)
         page.clock.go(0.4 * page.clock.end, playing=True)
         tab.wait_for_timeout(1000 * SETTLED)
         counted = tab.evaluate(COUNT, seconds)

@@ -138,7 +138,7 @@ class Stage:
         """
         self.motion = m = sample_motion(plan, rollout, {})
         self.reached = keyframe_times(plan, rollout)
-        self.changes = ["start", *(str(c.step) for c in plan.changes)]
+        self.changes = [str(c.step) for c in plan.changes]
         as_planned = rollout is None or rollout.followed is None
         trajectory = plan.trajectory if as_planned else None
         self._swings = [] if trajectory is None else swings_of(m, trajectory)
@@ -186,9 +186,9 @@ class Stage:
         return sorted({0.0, *self.motion.events, *keys, self.duration})
 
     def change_at(self, t: float) -> str:
-        """The contact change that led to the last keyframe up to a time [s]."""
-        past = [i for i, at in enumerate(self.reached) if at is not None and at <= t]
-        return self.changes[past[-1] if past else 0]
+        """The contact change that is under way at a time [s]."""
+        pairs = zip(self.changes, self.reached[1:], strict=True)
+        return next((c for c, at in pairs if at is None or at > t), "done")
 
     def show(self, t: float, layers: Mapping[str, bool]) -> str:
         """Send what differs from the last time; figures of this one, as HTML."""
