@@ -98,7 +98,7 @@ def urdf(*, mimic_knee: bool = False, mesh: str = "") -> str:
         mimic_knee: One knee follows the other.
         mesh: File name of a mesh that the torso is drawn with.
     """
-    text = (Path(__file__).parent / "small.urdf").read_text().rstrip()
+    text = (Path(__file__).parent / "data" / "small.urdf").read_text().rstrip()
     if mimic_knee:
         start = text.index("</joint>", text.index('<joint name="q3j"'))
         text = text[:start] + '<mimic joint="p3j"/>' + text[start:]

@@ -16,7 +16,7 @@ from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
 
-FIGURES = yaml.safe_load((Path(__file__).parent / "coman.yaml").read_text())
+FIGURES = yaml.safe_load((Path(__file__).parent / "data" / "coman.yaml").read_text())
 NAMES = tuple(FIGURES)
 SURFACES = ("LHand", "RHand", "LElbow", "RElbow", "LKnee", "RKnee", "LFoot", "RFoot")
 WRISTS = tuple(n for n in FIGURES["coman29"]["joints"] if "Wrj" in n or "Forearm" in n)
