@@ -2,42 +2,41 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that was measured or done, at a time [s] of the run."""
+    """Something that was measured or done, at a time [s] of the run.
 
+    Lengths are in metres, angles in radians. `says` is the sentence, its fields filled
+    in by `str`.
+    """
+
+    says: ClassVar[str]
     time: float
+
+    def __str__(self) -> str:
+        """For people."""
+        return self.says.format(**asdict(self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heavier(Event):
-    """The robot's mass is another than described, by this factor."""
+    """The robot's mass is another than described."""
 
+    says = "weighs {factor:.0%} of what its description says"
     factor: float
-
-    def __str__(self) -> str:
-        """The factor in percent."""
-        return f"weighs {100 * self.factor:.0f} % of what its description says"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartsElsewhere(Event):
-    """The robot does not stand where it was planned: off by [m], turned by [rad]."""
+    """The robot does not stand where it was planned."""
 
+    says = "starts {distance:.3f} m and {yaw:.2f} rad from where it was planned"
     distance: float
     yaw: float
-
-    def __str__(self) -> str:
-        """In millimetres and degrees."""
-        return (
-            f"starts {1e3 * self.distance:.0f} mm and {math.degrees(self.yaw):.0f}"
-            " degrees from where it was planned"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +46,7 @@ class ContactMoved(Event):
     Attributes:
         surface: That is in contact.
         planned: That was planned to be; another one of the same limb, or the same.
-        above, aside: Off along the support's normal and across it [m].
+        above, aside: Off along the support's normal and across it.
         made: It is just being made; otherwise it is part of the stance.
     """
 
@@ -58,112 +57,88 @@ class ContactMoved(Event):
     made: bool
 
     def __str__(self) -> str:
-        """Where, in millimetres."""
+        """For people."""
         verb = "touches" if self.made else "is"
         if self.surface != self.planned:
             return f"{self.surface} {verb} in place of {self.planned}"
         way = "above" if self.above > 0 else "below"
         return (
-            f"{self.surface} {verb} {1e3 * abs(self.above):.0f} mm {way},"
-            f" {1e3 * self.aside:.0f} mm beside its planned position"
+            f"{self.surface} {verb} {abs(self.above):.3f} m {way}, {self.aside:.3f} m"
+            " beside its planned position"
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Missing(Event):
-    """A contact to be made was probed for as deep as `depth` [m], and not found."""
+    """A contact to be made was probed for, `depth` deep, and not found."""
 
+    says = "{surface} finds no support within {depth:.2f} m of its planned position"
     surface: str
     depth: float
-
-    def __str__(self) -> str:
-        """How far was looked."""
-        return (
-            f"{self.surface} finds no support within {1e3 * self.depth:.0f} mm of its"
-            " planned position"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lost(Event):
-    """A contact of the stance carries no load.
+    """A contact of the stance carries no load: it is probed for again."""
 
-    Attributes:
-        surface: In contact.
-        given_up: It has been probed for again, in vain.
-    """
-
+    says = "{surface} carries no load: probed for again"
     surface: str
-    given_up: bool = False
 
-    def __str__(self) -> str:
-        """And what is done about it."""
-        if self.given_up:
-            return f"{self.surface} finds no support: the others carry the robot"
-        return f"{self.surface} carries no load: probed for again"
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GivenUp(Event):
+    """A lost contact was probed for in vain: the stance goes on without it."""
+
+    says = "{surface} finds no support: the others carry the robot"
+    surface: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unintended(Event):
     """A link carries load on a support where no contact was planned."""
 
+    says = "{link} touches {support} unintendedly: back, and on with extra clearance"
     link: str
     support: str
-
-    def __str__(self) -> str:
-        """And what is done about it."""
-        return (
-            f"unintended contact of {self.link} with {self.support}: back, and on with"
-            " extra clearance"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replanned(Event):
-    """The rest was planned again: so many contact changes."""
+    """What is left was planned again: so many contact changes."""
 
+    says = "replanned, contact changes left: {changes}"
     changes: int
-
-    def __str__(self) -> str:
-        """How many are left."""
-        return f"replanned: {self.changes} contact change{'s' * (self.changes != 1)}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NotReplanned(Event):
-    """No better plan was found.
+class KeptPlan(Event):
+    """No better plan was found: the one at hand is followed on."""
 
-    Attributes:
-        why: There is none.
-        stays: Nothing is left to do, and the robot stays in its stance; otherwise it
-            goes on with the plan at hand.
-    """
-
+    says = "goes on as planned ({why})"
     why: str
-    stays: bool
 
-    def __str__(self) -> str:
-        """What is done instead."""
-        does = "stays in this stance" if self.stays else "goes on as planned"
-        return f"{does} ({self.why})"
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeptStance(Event):
+    """No other plan was found, and none is needed: nothing is left to do."""
+
+    says = "stays in this stance ({why})"
+    why: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stopped(Event):
     """The robot stays in the stance that it has, before the end of the plan."""
 
+    says = "stopped: {why}"
     why: str
-
-    def __str__(self) -> str:
-        """Why."""
-        return f"stopped: {self.why}"
 
 
 EVENTS: dict[str, type[Event]] = {
     kind.__name__: kind
     for kind in (
-        *(Heavier, StartsElsewhere, ContactMoved, Missing, Lost, Unintended),
-        *(Replanned, NotReplanned, Stopped),
+        *(Heavier, StartsElsewhere, ContactMoved, Missing, Lost, GivenUp, Unintended),
+        *(Replanned, KeptPlan, KeptStance, Stopped),
     )
 }
 

@@ -32,10 +32,12 @@ from clamber.execution.estimate import LOST, TOUCH, Estimate
 from clamber.execution.events import (
     ContactMoved,
     Event,
+    GivenUp,
     Heavier,
+    KeptPlan,
+    KeptStance,
     Lost,
     Missing,
-    NotReplanned,
     Replanned,
     StartsElsewhere,
     Stopped,
@@ -411,7 +413,7 @@ class Executive:
             others = [x for x in self.stance if x is not c]
             found = yield from self._probe(c)
             if found is None:
-                self._note(Lost, surface=c.surface, given_up=True)
+                self._note(GivenUp, surface=c.surface)
                 yield from self._replan(others, others)
                 return True
             if found is not c or abs(self.estimate.deviation(c)[0]) > DEVIATION:
@@ -496,10 +498,10 @@ class Executive:
     def _keep_plan(self, off: float, why: str) -> Ticks:
         """No other plan was found: the one at hand may do, or may not."""
         if self._steps and self.done == self._steps:
-            self._note(NotReplanned, why=why, stays=True)
+            self._note(KeptStance, why=why)
             self._change = len(self._spans)
         elif off < FALLBACK:
-            self._note(NotReplanned, why=why, stays=False)
+            self._note(KeptPlan, why=why)
             self._ref.resume()
             if self._change > 0:
                 yield from self._ref.play(self._spans[self._change - 1].end)

@@ -128,23 +128,9 @@ def simulate(
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
     push = push_of(d, float(plan.trajectory.time[-1]))
     report = progress or (lambda stage, share, note: None)
-    start = world.home if plan.state is None else plan.state.q
-    planned = len(plan.trajectory.time)
-    return _run(world, start, follower, sensors, push, planned, report)
-
-
-def _run(
-    world: World,
-    start: np.ndarray,
-    controller: OpenLoop | Executive,
-    sensors: Sensors,
-    push: np.ndarray | None,
-    planned: int,
-    report: Callable[[str, float, str], None],
-) -> Rollout:
     model, log = world.model, _Log(world)
     data = mujoco.MjData(model)
-    data.qpos[:] = start
+    data.qpos[:] = world.home if plan.state is None else plan.state.q
     ctrl, speed = [], []
     tail = round(END / PHYSICS_STEP)
     order = np.array([model.actuator(j).id for j in world.joints])
@@ -154,13 +140,13 @@ def _run(
         if first:
             log.state(data)
         row = np.zeros(model.nu)
-        row[order] = controller.command(sensors.read(data))
+        row[order] = follower.command(sensors.read(data))
         ctrl.append(row)
         data.ctrl[:] = row
         if push is not None:
             data.xfrc_applied[world.base, :3] = push[k] if k < len(push) else 0.0
         mujoco.mj_step(model, data)
-        end = controller.left < tail
+        end = follower.left < tail
         if data.ncon:
             log.depth[-1] = max(log.depth[-1], -float(data.contact.dist.min()))
         if end:
@@ -169,12 +155,12 @@ def _run(
             log.contacts(data, k)
         if first:
             log.effort.append(data.actuator_force.copy())
-            fell = has_fallen(data.qpos, controller.reference)
+            fell = has_fallen(data.qpos, follower.reference)
         if k % 1000 == 0:
-            share = min(k / max(planned, k + controller.left), 1.0)
+            share = min(k / max(len(plan.trajectory.time), k + follower.left), 1.0)
             report("simulate", share, f"{k * PHYSICS_STEP:.0f} s")
         k += 1
-        if controller.left == 0:
+        if follower.left == 0:
             break
     report("simulate", 1.0, "")
     return Rollout(
@@ -185,10 +171,10 @@ def _run(
         surfaces=tuple(world.surfaces),
         end_speed=np.array(speed),
         push=None if push is None else _padded(push, k),
-        followed=controller.followed,
-        events=tuple(controller.events),
+        followed=follower.followed,
+        events=tuple(follower.events),
         fell=fell,
-        rests_on=controller.rests_on,
+        rests_on=follower.rests_on,
     )
 
 

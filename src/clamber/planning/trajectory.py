@@ -86,32 +86,20 @@ class Samples:
         """Rows, and columns of them where there are two indices."""
         rows, *columns = key if isinstance(key, tuple) else (key,)
         if isinstance(rows, (int, np.integer)):
-            k = int(rows) + (len(self) if rows < 0 else 0)
+            k = range(len(self))[rows]
             start, block = self._held
             if not start <= k < start + len(block):
-                if not 0 <= k < len(self):
-                    raise IndexError(f"row {rows} of {len(self)}")
                 start, block = self._look(np.searchsorted(self._ends, k, side="right"))
-            out = block[k - start]
-            return out[columns[0]] if columns else out
-        if isinstance(rows, slice):
-            some = self._gather(np.arange(*rows.indices(len(self))))
-            return some[(slice(None), *columns)]
-        index = np.asarray(rows)
-        index = np.flatnonzero(index) if index.dtype == bool else index
-        if index.size and not -len(self) <= index.min() <= index.max() < len(self):
-            raise IndexError(f"rows {index.min()} to {index.max()} of {len(self)}")
-        some = self._gather(index.ravel() % len(self))
-        return some[(np.arange(index.size).reshape(index.shape), *columns)]
-
-    def _gather(self, rows: np.ndarray) -> np.ndarray:
-        out = np.empty((len(rows), self.shape[1]))
-        number = np.searchsorted(self._ends, rows, side="right")
+            return block[(k - start, *columns)]
+        index = np.arange(len(self))[rows]
+        out = np.empty((index.size, self.shape[1]))
+        number = np.searchsorted(self._ends, index.ravel(), side="right")
         for i in np.unique(number):
             mine = number == i
             start, block = self._look(i)
-            out[mine] = block[rows[mine] - start]
-        return out
+            out[mine] = block[index.ravel()[mine] - start]
+        all_ = slice(None), np.arange(index.size).reshape(index.shape)
+        return out[(all_[not isinstance(rows, slice)], *columns)]
 
     def __iter__(self) -> Iterator[np.ndarray]:
         """Row after row."""
