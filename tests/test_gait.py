@@ -108,7 +108,7 @@ def on_fours(gait: Gait, x: float, yaw=0.0, support="table") -> tuple[Contact, .
     frame = Frame(np.array([x, 0.0]), yaw)
     limb_of = gait.world.robot.limb_of
     return tuple(
-        contact(s, *frame.at(gait.build.offsets[limb_of(s).name]), support, yaw)
+        contact(s, *frame.at(gait.proportions.offsets[limb_of(s).name]), support, yaw)
         for s in (*ELBOWS, *KNEES)
     )
 
@@ -131,7 +131,7 @@ class Obstinate:
         if isinstance(proposal, Climb):
             if proposal.start is not None:
                 *xy, yaw = proposal.start
-                feet = Frame(np.array(xy), yaw).at(self.gait.build.ahead)
+                feet = Frame(np.array(xy), yaw).at(self.gait.proportions.ahead)
                 stance = on_feet(*feet, yaw)
             rows = [(s.limb, s.breaks, (s.makes,), o) for s, o in proposal.steps]
         else:
@@ -210,8 +210,8 @@ def test_a_cycle_goes_no_farther_and_turns_no_more_than_it_may():
 
 
 def test_steps_are_a_third_of_a_limb_or_what_was_shown():
-    far = gait_in(table(), replace(POLICY, reach={"LElbow": 5.0})).build
-    near = gait_in(table(), replace(POLICY, reach={"LElbow": 0.1})).build
+    far = gait_in(table(), replace(POLICY, reach={"LElbow": 5.0})).proportions
+    near = gait_in(table(), replace(POLICY, reach={"LElbow": 0.1})).proportions
     assert near.step["left_arm"] == pytest.approx(0.3 * far.step["left_arm"])
     assert near.step["right_arm"] == far.step["right_arm"]
 
@@ -225,12 +225,12 @@ def test_feet_step_to_where_the_body_stands_before_the_edge():
     assert (walk.posture, walk.accept) == ("home", "some")
     # The right one first: the edge's middle is on its side.
     assert wanted(walk) == ("RFoot", "LFoot")
-    step = min(gait.build.step[n] for n in ("left_leg", "right_leg"))
+    step = min(gait.proportions.step[n] for n in ("left_leg", "right_leg"))
     for goal in walk.goals:
         lengths = [c.position[0] for c in goal.contacts]
         assert step >= lengths[0] > 0.0
         np.testing.assert_allclose(lengths, np.array(SHARES) * lengths[0])
-    assert walk.body.xy[0] <= 0.45 - gait.build.stand + 1e-9
+    assert walk.body.xy[0] <= 0.45 - gait.proportions.stand + 1e-9
     # One foot is enough, where the other cannot.
     able = Obstinate(gait, on_feet(0.0, 0.05), lambda c: c.surface == "LFoot")
     ((change, option),), _ = able.pursue()
@@ -255,10 +255,10 @@ def test_before_the_edge_hands_elbows_and_knees_climb_in_the_policys_order(gait)
 
 def test_a_descent_is_the_ascent_reversed_and_stands_up_at_its_end(gait):
     edge = gait.platforms[0].exit
-    back = on_fours(gait, 0.83 - gait.build.behind, math.pi)
+    back = on_fours(gait, 0.83 - gait.proportions.behind, math.pi)
     up, down = proposed(gait, back, refused=lambda c: False)
     assert (up.accept, wanted(up)) == ("never", (*HANDS, *ELBOWS, *KNEES))
-    ankles = gait.ankles(Frame.behind(edge, -gait.build.stand))
+    ankles = gait.ankles(Frame.behind(edge, -gait.proportions.stand))
     np.testing.assert_allclose(up.start, ankles)
     # Feet take the place of knees, hands that of elbows; then the hands let go.
     assert wanted(down) == ("RFoot", "LFoot", *HANDS[::-1], "-", "-")
@@ -279,7 +279,7 @@ def test_a_descent_is_the_ascent_reversed_and_stands_up_at_its_end(gait):
 
 def test_where_there_is_no_way_down_contacts_move_to_where_there_is(gait):
     """Only those that are elsewhere."""
-    back = on_fours(gait, 0.83 - gait.build.behind, math.pi)
+    back = on_fours(gait, 0.83 - gait.proportions.behind, math.pi)
     refused = lambda c: c.support == GROUND  # noqa: E731
     up, *_ = proposed(gait, back, refused)
     there = {s.makes.surface: s.makes for s, _ in up.steps}
@@ -314,7 +314,7 @@ def test_where_not_all_of_a_pair_fit_on_a_tread_both_go_to_their_next_places():
 
 def test_where_it_gets_no_nearer_to_the_edge_it_may_climb_down_from_there(gait):
     for away, down in ((0.08, True), (0.16, False)):
-        back = on_fours(gait, 0.83 - gait.build.behind - away, math.pi)
+        back = on_fours(gait, 0.83 - gait.proportions.behind - away, math.pi)
         *crawl, last = proposed(gait, back)
         assert cycles(crawl)
         assert isinstance(last, Climb) == down
@@ -335,7 +335,7 @@ def test_a_cycle_that_fails_is_proposed_otherwise_in_order(wide):
     frame = wide.quadrupedal_frame(stance)
     tries = cycles(proposed(wide, stance))
     full, legs, half, straight, turned = tries
-    assert frame.away(full.body) <= min(wide.build.step.values()) + 1e-9
+    assert frame.away(full.body) <= min(wide.proportions.step.values()) + 1e-9
     assert wanted(full) == (*ELBOWS, *KNEES)
     assert wanted(legs) == (*KNEES, *ELBOWS)
     assert legs.body is full.body
@@ -358,7 +358,7 @@ def test_the_others_come_back_around_a_limb_that_is_left_behind(wide):
     follows = [p for p in tries[6:] if wanted(p) == ("RKnee",)]
     assert set(map(wanted, back)) == {("LElbow", "RElbow", "LKnee")}
     assert all(p.after.changes for p in (*back, *follows))  # what was done is kept
-    offset = wide.build.offsets["right_leg"]
+    offset = wide.proportions.offsets["right_leg"]
     stuck = np.array([1.0, 0.0]) + offset
     for p, share in zip(back[:2], (1.0, 0.6), strict=True):
         np.testing.assert_allclose(p.body.local(stuck), share * offset, atol=1e-9)
@@ -374,7 +374,7 @@ def test_a_limb_that_lost_its_contact_is_set_down_first(wide):
         assert wanted(first) == (surface,)
         belongs, here = first.goals[0].contacts
         frame = wide.quadrupedal_frame(kept)
-        offset = wide.build.offsets[wide.world.robot.limb_of(surface).name]
+        offset = wide.proportions.offsets[wide.world.robot.limb_of(surface).name]
         np.testing.assert_allclose(frame.local(belongs.position), offset, atol=1e-9)
         assert np.linalg.norm(here.position - belongs.position) > SAME
         ((change, _),), _ = Obstinate(wide, kept, lambda c: False).pursue()
@@ -418,7 +418,7 @@ def test_knees_leave_their_thighs_room_before_a_riser():
 
     knee, elbow = placed("LKnee", riser - 0.07), placed("LElbow", riser - 0.07)
     assert (knee.support, elbow.support) == ("s1", "s1")
-    assert knee.position[0] <= riser - BEFORE_RISER * gait.build.thigh
+    assert knee.position[0] <= riser - BEFORE_RISER * gait.proportions.thigh
     assert elbow.position[0] > knee.position[0]
     assert knee.position[2] == pytest.approx(0.1)
     # What has climbed a riser is not put down before it again.
@@ -474,7 +474,7 @@ def near_gap(gap: Gait, arms: float, legs: float) -> tuple[Contact, ...]:
     out = []
     for s in (*ELBOWS, *KNEES):
         x = arms if s in ELBOWS else legs
-        y = gap.build.offsets[gap.world.robot.limb_of(s).name][1]
+        y = gap.proportions.offsets[gap.world.robot.limb_of(s).name][1]
         out.append(contact(s, x, y, "b1" if x < 1.0 else "b2"))
     return tuple(out)
 
@@ -489,7 +489,7 @@ def due(gap: Gait, arms: float, legs: float) -> tuple[dict[str, float], ...]:
         return gap.place(platform, on[n].surface, body, offset)
 
     frame, to = gap.quadrupedal_frame(stance), Frame(np.array([1.6, 0.0]), 0.0)
-    found = due_near_gap(gap.build, platform, on, frame, to, place)
+    found = due_near_gap(gap.proportions, platform, on, frame, to, place)
     return tuple({n: float(c.position[0]) for n, c in x.items()} for x in found)
 
 
@@ -502,10 +502,10 @@ def test_far_from_a_gap_and_beyond_it_nothing_is_due_there(gap):
 
 
 def test_arms_wait_at_a_gap_until_the_legs_are_near_enough(gap):
-    stretched = 2.0 * gap.build.stretch
+    stretched = 2.0 * gap.proportions.stretch
     walks, hops = due(gap, 0.80, 0.40)
     assert (set(walks), hops) == (LEGS, {})  # elbows are at the border already
-    assert max(walks.values()) <= 0.40 + gap.build.step["left_leg"] + SAME
+    assert max(walks.values()) <= 0.40 + gap.proportions.step["left_leg"] + SAME
     walks, hops = due(gap, 0.80, 0.98 - stretched + 0.01)
     assert set(hops) == ARMS
     assert all(1.15 <= x <= 1.17 for x in hops.values())
@@ -516,7 +516,7 @@ def test_arms_wait_at_a_gap_until_the_legs_are_near_enough(gap):
 def test_legs_step_across_together_once_the_arms_are_far_enough(gap):
     walks, hops = due(gap, 1.20, 0.80)
     assert (set(walks), hops) == (ARMS, {})
-    walks, hops = due(gap, 0.98 + 2.0 * gap.build.stretch, 0.80)
+    walks, hops = due(gap, 0.98 + 2.0 * gap.proportions.stretch, 0.80)
     assert set(hops) == LEGS
     assert all(1.15 <= x <= 1.17 for x in hops.values())
 
@@ -535,7 +535,7 @@ def test_a_gap_is_ahead_until_the_last_contact_is_over_it(gap):
 
 
 def test_where_knees_do_not_reach_across_they_do_from_a_stand_on_both_feet(gap):
-    stance = near_gap(gap, 0.98 + 2.0 * gap.build.stretch, 0.80)
+    stance = near_gap(gap, 0.98 + 2.0 * gap.proportions.stretch, 0.80)
     across = lambda c: c.surface in KNEES and c.support == "b2"  # noqa: E731
     tries = [p for p in cycles(proposed(gap, stance, across)) if p.rounds == FREELY]
     knees, stand, step = (p for p in tries if not set(wanted(p)) & set(ELBOWS))
@@ -596,7 +596,13 @@ def test_the_repr_of_all_that_is_proposed_is_short(wide):
     able = Obstinate(wide, on_fours(wide, 1.0), lambda c: c.surface == "RKnee")
     able.pursue()
     climb, *_ = proposed(wide, on_feet())
-    records = [climb, wide.build, wide.build.stairs, *wide.platforms, *able.asked]
+    records = [
+        climb,
+        wide.proportions,
+        wide.proportions.stairs,
+        *wide.platforms,
+        *able.asked,
+    ]
     records += [p.after for p in able.asked] + [able.asked[2].goals[0]]
     assert max(len(repr(r)) for r in records) < 300
 

@@ -87,7 +87,7 @@ class Gait:
         world: Robot and scene.
         policy: Its options, in order.
         cycle: The one on top of an obstacle (region O), if it has one; else the last.
-        build: Proportions of the robot.
+        proportions: Of the robot.
         platforms: Between start and goal.
         goal: (2,) where the body shall get to.
         goal_yaw: How it shall face there; None: as it does.
@@ -104,7 +104,7 @@ class Gait:
         on_top = (o for o in policy.options if o.region == "O")
         self.cycle = next(on_top, policy.options[-1])
         self._kin = Kinematics(world)
-        self.build = proportions_of(self._kin, policy)
+        self.proportions = proportions_of(self._kin, policy)
         self.goal = goal_of(scene)
         self.platforms = find_platforms(scene, self.goal)
         yaw = scene.goal
@@ -125,7 +125,7 @@ class Gait:
                 field="policy.options",
                 value=[o.region for o in self.policy.options],
             )
-        reach, height = self.build.reach, self.build.height
+        reach, height = self.proportions.reach, self.proportions.height
         for name in (b for p in self.platforms for b in p.boxes):
             top = float(self.world.supports[name].position[2])
             if top > height:
@@ -140,7 +140,7 @@ class Gait:
         if away > reach:
             raise InputError(
                 f"an obstacle within {reach:.2f} m, the robot's reach: it must first"
-                f" walk {away - self.build.stand:.2f} m",
+                f" walk {away - self.proportions.stand:.2f} m",
                 field=f"scene.boxes.{first.boxes[0]}",
                 value=f"{away:.2f} m away",
             )
@@ -184,10 +184,10 @@ class Gait:
                 return True
             yield self._walk(at, frame, wanted)
             return False
-        wanted = Frame.behind(ahead.entry, -self.build.stand)
+        wanted = Frame.behind(ahead.entry, -self.proportions.stand)
         off = wanted.local(frame.xy)
         if (
-            abs(off[0]) <= STAND_TOLERANCE * self.build.stand / STAND
+            abs(off[0]) <= STAND_TOLERANCE * self.proportions.stand / STAND
             and abs(off[1]) <= BESIDE_TOLERANCE
             and abs(frame.turn_to(wanted)) <= FACING
         ):
@@ -207,15 +207,17 @@ class Gait:
     def _walk(self, at: Outcome, frame: Frame, wanted: Frame) -> Proposal:
         """One step of each foot towards where it shall stand."""
         legs = [x for x in self.world.robot.limbs.values() if not x.is_arm]
-        step = min(self.build.step[x.name] for x in legs)
+        step = min(self.proportions.step[x.name] for x in legs)
         body = frame.towards(wanted, step, STEP_TURN)
-        turn = self.build.feet * frame.turn_to(body)
+        turn = self.proportions.feet * frame.turn_to(body)
         left_first = frame.local(body.xy)[1] + turn > 0
         legs.sort(key=lambda x: x.name.startswith("left") != left_first)
         goals = []
         for leg in legs:
             left = 1.0 if leg.name.startswith("left") else -1.0
-            to = np.array([*body.at(np.array([0.0, left * self.build.feet])), 0.0])
+            to = np.array(
+                [*body.at(np.array([0.0, left * self.proportions.feet])), 0.0]
+            )
             ground = self.world.supports[GROUND]
             contact = contact_at(leg.surfaces[0], ground, to, body.yaw)
             goals.append(self._goal(at, self.policy.options[-1], contact))
@@ -230,7 +232,7 @@ class Gait:
 
     def ankles(self, body: Frame) -> np.ndarray:
         """(3,) x, y, yaw of the ankles' midpoint where the feet are at the body's."""
-        return np.array([*body.at(-self.build.ahead), body.yaw])
+        return np.array([*body.at(-self.proportions.ahead), body.yaw])
 
     # Up and down.
 
@@ -238,7 +240,7 @@ class Gait:
         self, at: Outcome, platform: Platform
     ) -> list[tuple[Contact, ...]]:
         """What goes up a flight of stairs next; empty where it is none, or is up."""
-        flight = Flight(self.world, platform, self.goal, self.build.stairs)
+        flight = Flight(self.world, platform, self.goal, self.proportions.stairs)
         return flight.next_contacts(at.stance) if flight.is_climbable() else []
 
     def _mount(self, at: Outcome, platform: Platform) -> Part:
@@ -290,7 +292,7 @@ class Gait:
                     continue
                 if option.region == "O" and limb.is_arm and limb.name in on:
                     continue
-                offset = self.build.mount(limb, surface)
+                offset = self.proportions.mount(limb, surface)
                 contact = self.place(platform, surface, Frame.behind(edge), offset)
                 breaks = () if limb.is_arm else limb.surfaces[:1]
                 if limb.name in on:
@@ -309,7 +311,7 @@ class Gait:
         """
         edge = platform.exit
         assert edge is not None
-        ankles = self.ankles(Frame.behind(edge, -self.build.stand))
+        ankles = self.ankles(Frame.behind(edge, -self.proportions.stand))
         ascent = self._ascent(edge, platform)
         up = yield Climb(after=at, steps=ascent, start=ankles, accept="never")
         if up.failure:
@@ -351,7 +353,7 @@ class Gait:
             yield from self._crawl(at, platform, frame, wanted)
             return False
         # It faces inwards, and climbs down backwards.
-        wanted = Frame.behind(edge, self.build.behind)
+        wanted = Frame.behind(edge, self.proportions.behind)
         if not frame.is_at(wanted):
             yield from self._crawl(at, platform, frame, wanted)
             if frame.away(wanted) > NEARLY:
@@ -362,7 +364,7 @@ class Gait:
     def quadrupedal_frame(self, stance: Sequence[Contact]) -> Frame:
         """The middle of the contacts; the yaw that fits them best on all fours."""
         limbs = [self.world.robot.limb_of(c.surface).name for c in stance]
-        offsets = [self.build.offsets[n] for n in limbs]
+        offsets = [self.proportions.offsets[n] for n in limbs]
         middle = np.mean([c.position[:2] for c in stance], axis=0)
         centre = np.mean(offsets, axis=0)
         dot = cross = 0.0
@@ -387,7 +389,7 @@ class Gait:
             self._kin.update(at.key.q)
             here = self._kin.contact_point(surface, np.array([0.0, 0.0, 1.0]))[:2]
             contacts = (
-                self.place(platform, surface, frame, self.build.offsets[limb]),
+                self.place(platform, surface, frame, self.proportions.offsets[limb]),
                 self.place(platform, surface, Frame(here, frame.yaw), np.zeros(2)),
             )
             goals = [Goal(self.cycle.name, contacts)]
@@ -405,7 +407,7 @@ class Gait:
             wanted = Frame(wanted.xy, platform.entry.yaw)
         heading = self.heading(platform, frame, wanted)
         yield from self._over_gap(at, platform, frame, heading)
-        full = frame.towards(heading, min(self.build.step.values()), TURN)
+        full = frame.towards(heading, min(self.proportions.step.values()), TURN)
         leading = self.leading_first(frame, full)
         if self.has_risers(platform):
             # The second knee over a riser wants the elbows near, so that knees may have
@@ -456,7 +458,9 @@ class Gait:
             if here is not None and back:
                 low = tops[here.support] - FLUSH
                 boxes = tuple(n for n in boxes if tops[n] >= low)
-            there = self.place(platform, surface, body, self.build.offsets[limb], boxes)
+            there = self.place(
+                platform, surface, body, self.proportions.offsets[limb], boxes
+            )
             if here is None or surface != here.surface or not _is_same(here, there):
                 goals.append(self._goal(at, self.cycle, there))
         accept = "never" if back else "all"
@@ -477,7 +481,7 @@ class Gait:
         # Over a riser it may follow before all are back.
         groups = [[s] for s in others] if self.has_risers(platform) else [others]
         for nearer in NEARER:
-            offset = (1.0 - nearer) * self.build.offsets[limb]
+            offset = (1.0 - nearer) * self.proportions.offsets[limb]
             xy = here.position[:2] - turn_about_z(body.yaw) @ offset
             around, now = Frame(xy, body.yaw), at
             for group in groups:
@@ -503,7 +507,7 @@ class Gait:
         """
         if abs(frame.turn_to(wanted)) <= FACING:
             return wanted
-        radius, scene = self.build.radius, self.world.scene
+        radius, scene = self.proportions.radius, self.world.scene
         if room_on(scene, platform.boxes, frame.xy) < radius:
             if frame.away(wanted) > ARRIVED:
                 return Frame(wanted.xy, frame.yaw)
@@ -524,7 +528,7 @@ class Gait:
         if abs(frame.turn_to(wanted)) > FACING or not on.keys() >= inner.keys():
             return
         walks, hops = due_near_gap(
-            self.build,
+            self.proportions,
             platform,
             {n: on[n] for n in inner},
             frame,
@@ -592,7 +596,7 @@ class Gait:
         boxes, wanted = boxes or platform.boxes, body.at(offset)
         beside = self.world.surfaces[surface].radius + CLEAR
         if self.has_risers(platform) and not self.world.robot.limb_of(surface).is_arm:
-            beside = max(beside, BEFORE_RISER * self.build.thigh)
+            beside = max(beside, BEFORE_RISER * self.proportions.thigh)
         found = find_place(self.world.scene, boxes, wanted, beside)
         name, point = found or (boxes[0], np.array([*wanted, 0.0]))
         return contact_at(surface, self.world.supports[name], point, body.yaw)
@@ -612,7 +616,7 @@ class Gait:
         angles = pelvis_angles(self._kin.rotation(self.world.base))
         position = np.array([*body.xy, key.q[2]])
         held = pelvis_distribution(
-            self.policy, platform.edges, position, near=self.build.thigh
+            self.policy, platform.edges, position, near=self.proportions.thigh
         )
         if held is not None:
             angles[0] = held.clip(angles)[0]

@@ -34,7 +34,7 @@ def gaps_ahead(
 
 
 def due_near_gap(
-    build: Proportions,
+    proportions: Proportions,
     platform: Platform,
     on: Mapping[str, Contact],
     frame: Frame,
@@ -48,14 +48,14 @@ def due_near_gap(
     empty far from a gap.
 
     Args:
-        build: The robot's.
+        proportions: The robot's.
         platform: With gaps.
         on: Contacts of all limbs, by limb, in the order in which they step.
         frame: Where the body is.
         wanted: Where it shall get to.
         place: Where a limb finds a place, nearest to a point (2,) of a frame.
     """
-    step = min(build.step.values())
+    step = min(proportions.step.values())
     length = frame.away(wanted)
     way = (wanted.xy - frame.xy) / max(length, 1e-9)
     at = {n: float((c.position[:2] - frame.xy) @ way) for n, c in on.items()}
@@ -63,8 +63,8 @@ def due_near_gap(
     if not gaps or gaps[0][0] > max(at.values()) - min(at.values()) + step:
         return {}, {}
     offsets = {
-        n: np.array([math.copysign(build.stretch, o[0]), o[1]])
-        for n, o in build.offsets.items()
+        n: np.array([math.copysign(proportions.stretch, o[0]), o[1]])
+        for n, o in proportions.offsets.items()
     }
 
     def stretched(n: str, x: float) -> Contact:

@@ -312,7 +312,7 @@ def quadrupedal_posture(ik: IK, gait: Gait) -> np.ndarray:
     frame = Frame(world.scene.start[:2], float(world.scene.start[2]))
     contacts = []
     for surface in gait.cycle.surfaces:
-        xy = frame.at(gait.build.offsets[world.robot.limb_of(surface).name])
+        xy = frame.at(gait.proportions.offsets[world.robot.limb_of(surface).name])
         point = np.array([*xy, 0.0])
         contacts.append(contact_at(surface, world.supports[GROUND], point, frame.yaw))
     held = pelvis_rotation(np.array([0.0, LEAN, frame.yaw]))
