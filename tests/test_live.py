@@ -19,11 +19,11 @@ from clamber import cli
 from clamber.errors import InputError, MissingDependency
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
-from clamber.show import edits
+from clamber.show import editor
 from clamber.show.live import open_view
 from clamber.show.page import Clock, paragraphs
 from clamber.show.sample import keyframe_times
-from clamber.show.skeleton import beside, skeleton_of
+from clamber.show.skeleton import beside, paired_times, skeleton_of
 
 NASTY = "<img src=x onerror=alert(1)>"
 
@@ -59,7 +59,7 @@ def test_beside_leaves_a_gap_between_the_boxes():
 
 def test_the_person_makes_its_contacts_when_the_robot_does(one_hand_plan: Plan):
     reached = keyframe_times(one_hand_plan, None)
-    robot, person = edits.paired_times(one_hand_plan, reached, 99.0)
+    robot, person = paired_times(one_hand_plan, reached, 99.0)
     assert np.interp(reached[1] or 0.0, robot, person) == pytest.approx(1.0)
     assert np.all(np.diff(robot) > 0)
     assert np.all(np.diff(person) >= 0)
@@ -69,10 +69,10 @@ def test_the_person_makes_its_contacts_when_the_robot_does(one_hand_plan: Plan):
 
 
 def test_a_contact_that_is_moved_is_planned_where_it_was_put(one_hand_plan: Plan):
-    (hand,) = edits.intervals_of(one_hand_plan)
+    ((name, hand),) = editor.intervals_of(one_hand_plan).items()
     assert hand.contact.surface == "LHand"
     place = hand.planned + np.array([0.04, 0.03, 0.1])
-    again = edits.plan_edited(one_hand_plan, edits.Edits(moved={0: place}))
+    again = editor.plan_edited(one_hand_plan, {name: place}, ())
     assert again.complete
     made = next(c for c in again.keyframes[1].stance if c.surface == "LHand")
     np.testing.assert_allclose(made.position[:2], place[:2], atol=0.005)
@@ -80,30 +80,29 @@ def test_a_contact_that_is_moved_is_planned_where_it_was_put(one_hand_plan: Plan
 
 
 def test_no_edit_is_the_same_plan(one_hand_plan: Plan):
-    again = edits.plan_edited(one_hand_plan, edits.Edits())
+    again = editor.plan_edited(one_hand_plan, {}, ())
     for a, b in zip(again.keyframes, one_hand_plan.keyframes, strict=True):
         np.testing.assert_array_equal(a.q, b.q)
 
 
 def test_a_surface_that_is_off_makes_no_contact(one_hand_plan: Plan):
-    off = edits.Edits(off=frozenset({"LHand"}))
-    sequence = edits.edited_sequence(one_hand_plan, off)
+    sequence = editor.edited_sequence(one_hand_plan, {}, {"LHand"})
     assert not any("LHand" in s.surfaces for s in sequence.stances)
-    assert not edits.plan_edited(one_hand_plan, off).complete
+    assert not editor.plan_edited(one_hand_plan, {}, {"LHand"}).complete
 
 
 def test_saving_writes_a_run_of_its_own_and_overwrites_nothing(
     one_hand_plan: Plan, tmp_path: Path
 ):
-    hand = edits.intervals_of(one_hand_plan)[0]
-    again = edits.plan_edited(one_hand_plan, edits.Edits(moved={0: hand.planned}))
-    first, second = (edits.save_edited(tmp_path, again) for _ in range(2))
+    ((name, hand),) = editor.intervals_of(one_hand_plan).items()
+    again = editor.plan_edited(one_hand_plan, {name: hand.planned}, ())
+    first, second = (editor.save_edited(tmp_path, again) for _ in range(2))
     assert [first.name, second.name] == ["edited", "edited-2"]
     elsewhere = tmp_path.parent / f"{tmp_path.name}-elsewhere"
     elsewhere.mkdir()
     for n, target in ((3, elsewhere), (4, tmp_path / "nowhere")):
         (tmp_path / f"edited-{n}").symlink_to(target)  # nobody's way out of the folder
-    assert edits.save_edited(tmp_path, again).name == "edited-5"
+    assert editor.save_edited(tmp_path, again).name == "edited-5"
     assert not list(elsewhere.iterdir())
     assert not (tmp_path / "nowhere").exists()
     assert clamber.load_plan(first).complete

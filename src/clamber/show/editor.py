@@ -1,32 +1,157 @@
-"""The panel that edits a plan: contacts to drag, surfaces to leave out, plan again."""
+"""Editing a plan on its page: contacts to drag, surfaces to leave out, plan again.
+
+Edits are made to the sequence of a plan, which is in the robot's scene and at its
+scale; it is planned again as ever.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from clamber.contact.contact import Contact, ContactSequence
+from clamber.contact.steps import same_place
 from clamber.errors import ClamberError
 from clamber.execution.simulation import Rollout, simulate
 from clamber.execution.verdict import Verdict, judge
 from clamber.model.se3 import quat_from_matrix
-from clamber.planning.records import Plan
-from clamber.show.edits import (
-    INSET,
-    Edits,
-    Interval,
-    intervals_of,
-    plan_edited,
-    save_edited,
+from clamber.planning import planner
+from clamber.planning.records import Plan, Progress
+from clamber.planning.substitutes import without_surfaces
+from clamber.run.folder import (
+    SEQUENCE,
+    next_free_folder,
+    save_plan,
+    save_rollout,
+    save_sequence,
+    save_verdict,
 )
 from clamber.show.page import Page, paragraphs
 
+INSET = 0.01  # [m] a contact that is dragged stays so far inside its support
+FOLDER = "edited"  # in the run folder
 GIZMO = 0.22  # [m]
 NOTHING = "none"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Interval:
+    """A contact over the stances of a sequence that hold it.
+
+    Attributes:
+        contact: As the sequence has it.
+        first, last: Its first stance, and the one after its last.
+        planned: (3,) where the plan makes it [m], which optimises what it is shown.
+    """
+
+    contact: Contact
+    first: int
+    last: int
+    planned: np.ndarray
+
+
+def intervals_of(plan: Plan) -> dict[str, Interval]:
+    """The contacts of a plan's sequence that can be moved: those made on the way.
+
+    By a name for people, in order.
+    """
+    stances = plan.sequence.stances
+    planned = {
+        (c.step.stance, x.surface): x.position
+        for c in plan.changes
+        if c.step.index is not None
+        for x in c.keyframe.stance
+    }
+    found = []
+    for surface in plan.world.surfaces:
+        before = None
+        for i, stance in enumerate(stances):
+            c = stance.contact(surface)
+            if c is not None and i > 0 and not (before and same_place(before, c)):
+                last = i + 1
+                while last < len(stances):
+                    d = stances[last].contact(surface)
+                    if d is None or not same_place(c, d):
+                        break
+                    last += 1
+                place = planned.get((i, surface), c.position)
+                found.append(Interval(contact=c, first=i, last=last, planned=place))
+            before = c
+    found.sort(key=lambda x: x.first)
+    return {f"{_on(x.contact)}, stance {x.first}": x for x in found}
+
+
+def _on(c: Contact) -> str:
+    return f"{c.surface} on {c.support}"
+
+
+def edited_sequence(
+    plan: Plan, moved: Mapping[str, np.ndarray], off: Collection[str]
+) -> ContactSequence:
+    """The sequence of a plan with contacts moved and surfaces left out.
+
+    Args:
+        plan: It.
+        moved: Places (3,) of contacts by the names of their intervals [m].
+        off: Surfaces that are not to be used.
+    """
+    intervals, stances = intervals_of(plan), list(plan.sequence.stances)
+    for name, place in moved.items():
+        x = intervals[name]
+        on = plan.world.supports[x.contact.support].nearest(place, INSET)
+        contact = replace(x.contact, position=on, fixed=True)
+        for i in range(x.first, x.last):
+            kept = (
+                contact if c.surface == contact.surface else c
+                for c in stances[i].contacts
+            )
+            stances[i] = replace(stances[i], contacts=tuple(kept))
+    sequence = replace(plan.sequence, stances=tuple(stances))
+    return without_surfaces(sequence, off)
+
+
+def plan_edited(
+    plan: Plan,
+    moved: Mapping[str, np.ndarray],
+    off: Collection[str],
+    progress: Progress | None = None,
+) -> Plan:
+    """Plan again, with contacts moved and surfaces left out as in `edited_sequence`.
+
+    Raises:
+        InputError: The scene does not fit what is left of the sequence.
+    """
+    sequence, world = edited_sequence(plan, moved, off), plan.world
+    return planner.plan(
+        sequence, world.robot, world.scene, options=plan.options, progress=progress
+    )
+
+
+def save_edited(
+    folder: Path, plan: Plan, done: tuple[Rollout, Verdict] | None = None
+) -> Path:
+    """Save a plan, and what physics made of it, as a run of its own.
+
+    Args:
+        folder: The run folder: `edited` in it, or `edited-2` ... where that exists.
+        plan: It.
+        done: Rollout and verdict, where it has been simulated.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    out = next_free_folder(folder, FOLDER)
+    save_sequence(plan.sequence, out / SEQUENCE)
+    save_plan(plan, out)
+    if done is not None:
+        save_rollout(plan, done[0], out)
+        save_verdict(done[1], out)
+    return out
 
 
 class Editor:
@@ -50,7 +175,8 @@ class Editor:
         """
         self._folder, self._plan, self._replaced = folder, plan, replaced
         self._intervals = intervals_of(plan)
-        self._edits = Edits()
+        self._moved: dict[str, np.ndarray] = {}
+        self._off: frozenset[str] = frozenset()
         self._new: Plan | None = None
         self._done: tuple[Rollout, Verdict] | None = None
         self._busy = threading.Lock()
@@ -63,8 +189,7 @@ class Editor:
         surfaces = [
             s for s in plan.world.surfaces if any(s in x.surfaces for x in stances)
         ]
-        names = (NOTHING, *(x.name for x in self._intervals))
-        self._choice = gui.add_dropdown("move", names)
+        self._choice = gui.add_dropdown("move", (NOTHING, *self._intervals))
         self._use = {s: gui.add_checkbox(f"use {s}", True) for s in surfaces}
         self._buttons = {
             "Re-plan": self._plan_again,
@@ -91,48 +216,41 @@ class Editor:
             self._handles[name].on_click(lambda _, job=job: self._work(job))
         self._enable()
 
-    def _chosen(self) -> tuple[int, Interval] | None:
-        named = enumerate(self._intervals)
-        return next((x for x in named if x[1].name == self._choice.value), None)
-
     def _choose(self) -> None:
         """Put the gizmo on the contact that is chosen."""
-        chosen = self._chosen()
-        self._gizmo.visible = chosen is not None
-        if chosen is not None:
-            index, interval = chosen
-            support = self._plan.world.supports[interval.contact.support]
+        name = str(self._choice.value)
+        self._gizmo.visible = name != NOTHING
+        if name != NOTHING:
+            x = self._intervals[name]
+            support = self._plan.world.supports[x.contact.support]
             self._gizmo.wxyz = quat_from_matrix(support.rotation)
-            self._gizmo.position = self._edits.moved.get(index, interval.planned)
+            self._gizmo.position = self._moved.get(name, x.planned)
 
     def _dragged(self, event: Any) -> None:
         """Keep the contact on its support."""
-        chosen = self._chosen()
-        if chosen is None:
+        name = str(self._choice.value)
+        if name == NOTHING:
             return
-        index, interval = chosen
-        support = self._plan.world.supports[interval.contact.support]
+        support = self._plan.world.supports[self._intervals[name].contact.support]
         place = support.nearest(np.array(self._gizmo.position), INSET)
-        self._edits = replace(self._edits, moved={**self._edits.moved, index: place})
+        self._moved[name] = place
         if event.phase == "end":
             self._gizmo.position = place
             self._tell()
 
     def _switched(self) -> None:
         """Surfaces that are not to be used."""
-        off = frozenset(s for s, box in self._use.items() if not box.value)
-        self._edits = replace(self._edits, off=off)
+        self._off = frozenset(s for s, box in self._use.items() if not box.value)
         self._tell()
 
     def _tell(self, *more: str) -> None:
         """What is edited, and what came of it."""
+        off = {n: p - self._intervals[n].planned for n, p in self._moved.items()}
         said = [
-            f"{self._intervals[i].name}: moved by "
-            f"{1000 * np.linalg.norm(p - self._intervals[i].planned):.0f} mm"
-            for i, p in self._edits.moved.items()
+            f"{n}: moved by {1000 * np.linalg.norm(d):.0f} mm" for n, d in off.items()
         ]
-        if self._edits.off:
-            said.append(f"without {', '.join(sorted(self._edits.off))}")
+        if self._off:
+            said.append(f"without {', '.join(sorted(self._off))}")
         self._said.content = paragraphs([*said, *more])
         self._enable()
 
@@ -144,7 +262,9 @@ class Editor:
             busy or new is None or new.trajectory is None
         )
         self._handles["Save"].disabled = busy or new is None
-        self._handles["Undo all"].disabled = busy or not (self._edits or new)
+        self._handles["Undo all"].disabled = busy or not (
+            self._moved or self._off or new
+        )
 
     def _work(self, job: Callable[[], str]) -> None:
         """Do one thing at a time; what goes wrong is said, not thrown."""
@@ -165,7 +285,7 @@ class Editor:
         self._said.content = paragraphs([f"{stage}: {note}" if note else stage])
 
     def _plan_again(self) -> str:
-        self._new = plan = plan_edited(self._plan, self._edits, self._report)
+        self._new = plan = plan_edited(self._plan, self._moved, self._off, self._report)
         self._done = None
         self._replaced(plan, None)
         if plan.complete:
@@ -188,7 +308,8 @@ class Editor:
         return f"Saved as {save_edited(self._folder, self._new, self._done)}"
 
     def _forget(self) -> str:
-        self._edits, self._new, self._done = Edits(), None, None
+        self._moved, self._off = {}, frozenset()
+        self._new = self._done = None
         self._choice.value = NOTHING
         for box in self._use.values():
             box.value = True

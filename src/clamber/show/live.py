@@ -22,12 +22,11 @@ from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import PLAN, SEQUENCE, fallback_note, load_sequence
 from clamber.show.editor import Editor
-from clamber.show.edits import paired_times
 from clamber.show.page import Page
 from clamber.show.renderer import seen_points
 from clamber.show.sample import Run, read_run, thinned
 from clamber.show.scene3d import Figure, Stage
-from clamber.show.skeleton import Skeleton, beside, skeleton_of
+from clamber.show.skeleton import Skeleton, beside, paired_times, skeleton_of
 
 FOVY = 45.0  # [deg] of what has no model
 PERSON_LAYER = "recording"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -199,15 +200,8 @@ def _draw_options(ax: Axes, policy: GeneralPolicy) -> None:
             y = 0.27 - 0.17 * row
             text = ", ".join(line)
             ax.text(k + 0.35, y, text, ha="center", va="center", fontsize=8)
-        loop = FancyArrowPatch(
-            (k + 0.5, 0.66),
-            (k + 0.2, 0.66),
-            connectionstyle="arc3,rad=1.0",
-            arrowstyle="-|>",
-            mutation_scale=9,
-            color="0.3",
-        )
-        ax.add_patch(loop)
+        look = {"connectionstyle": "arc3,rad=1.0", "mutation_scale": 9}
+        _arrow(ax, (k + 0.5, 0.66), (k + 0.2, 0.66), **look)
         ax.text(k + 0.35, 0.87, f"{option.repeats} times", ha="center", fontsize=7)
         if k + 1 < n:
             _arrow(ax, (k + 0.75, 0.3), (k + 0.95, 0.3))
@@ -228,29 +222,16 @@ def _draw_table(ax: Axes, demo: DemoPolicy) -> None:
             break
         _arrow(ax, (x + 0.22, y), (x + 0.78, y))
         action = demo.actions[i]
-        weak = i not in ruling
-        ax.text(
-            x + 0.5,
-            y + 0.1,
-            "gives up" if action is None else action,
-            ha="center",
-            fontsize=6.5,
-            color="0.55" if weak else "0.0",
-            style="italic" if weak else "normal",
-        )
+        look = {"color": "0.55", "style": "italic"} if i not in ruling else {}
+        text = "gives up" if action is None else action
+        ax.text(x + 0.5, y + 0.1, text, ha="center", fontsize=6.5, **look)
     rows = math.ceil(len(demo.states) / PER_ROW)
     for k, (region, text) in enumerate(MEANING.items()):
         x, y = 1.6 * k, -0.8 * rows
         ax.add_patch(Circle((x, y), 0.12, fc=COLOURS[region], ec="0.3", lw=0.8))
         ax.text(x + 0.2, y, text, va="center", fontsize=7.5)
-    ax.text(
-        1.6 * 3,
-        -0.8 * rows,
-        "grey: another surface of the limb bears the load",
-        va="center",
-        fontsize=7.5,
-        color="0.45",
-    )
+    grey = "grey: another surface of the limb bears the load"
+    ax.text(1.6 * 3, -0.8 * rows, grey, va="center", fontsize=7.5, color="0.45")
     ax.set_xlim(-0.4, PER_ROW - 0.1)
     ax.set_ylim(-0.8 * rows - 0.3, 0.4)
     ax.set_aspect("equal")
@@ -259,19 +240,11 @@ def _draw_table(ax: Axes, demo: DemoPolicy) -> None:
     ax.set_title(title, fontsize=9, loc="left")
 
 
-def _arrow(ax: Axes, a: tuple[float, float], b: tuple[float, float]) -> None:
-    ax.add_patch(
-        FancyArrowPatch(
-            a,
-            b,
-            arrowstyle="-|>",
-            mutation_scale=8,
-            color="0.3",
-            lw=0.8,
-            shrinkA=0,
-            shrinkB=0,
-        )
-    )
+def _arrow(
+    ax: Axes, a: tuple[float, float], b: tuple[float, float], **look: Any
+) -> None:
+    look = {"mutation_scale": 8, "lw": 0.8, "shrinkA": 0, "shrinkB": 0, **look}
+    ax.add_patch(FancyArrowPatch(a, b, arrowstyle="-|>", color="0.3", **look))
 
 
 def pelvis_plot(policy: GeneralPolicy, path: str | Path) -> Path:

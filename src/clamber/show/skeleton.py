@@ -5,12 +5,14 @@ Shapes: T samples, F points, B bones.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from clamber.contact.contact import ContactInterval, ContactSequence
 from clamber.model.scene import Scene
+from clamber.planning.records import Plan
 from clamber.recording.demonstration import SIDES, Demonstration, wrist
 
 CHEST = "Chest"  # the middle of the shoulders, which no recording has
@@ -115,3 +117,29 @@ def _corners(scene: Scene) -> np.ndarray:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     corners = [b.position + (signs * b.size / 2) @ b.rotation.T for b in scene.boxes]
     return np.concatenate(corners) if corners else np.zeros((0, 3))
+
+
+def paired_times(
+    plan: Plan, reached: Sequence[float | None], end: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) of robot and person at which they make the same contact [s].
+
+    Between them the one clock is the other one, stretched.
+
+    Args:
+        plan: What was to be done.
+        reached: When each keyframe is reached [s].
+        end: Of the robot's motion [s].
+    """
+    t = plan.sequence.t
+    robot, person = [0.0], [float(t[0])]
+    for change, at in zip(plan.changes, reached[1:], strict=True):
+        if change.step.index is None or at is None:
+            continue
+        if at > robot[-1]:
+            robot.append(at)
+            person.append(float(t[change.step.stance]))
+    if end > robot[-1]:
+        robot.append(end)
+        person.append(float(t[-1]))
+    return np.array(robot), np.array(person)
