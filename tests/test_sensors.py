@@ -105,19 +105,6 @@ def test_without_noise_and_delay_it_is_the_truth(world):
         assert np.array_equal(reading.force, force)
 
 
-def test_a_reading_is_a_copy(world, stood):
-    """What is sensed stays as it was while the simulation goes on."""
-    s, readings, states = sensors(world), [], []
-    for _, data in moving(world, 12):
-        readings.append(s.read(data))
-        states.append(data.qpos.copy())
-    for r, q in zip(readings, states, strict=True):
-        assert np.array_equal(r.q, q)
-    q = stood.qpos.copy()
-    sensors(world, noise=5.0).read(stood)
-    assert np.array_equal(stood.qpos, q)
-
-
 def test_forces_are_renewed_every_few_steps_only(world):
     s, forces = sensors(world, noise=1.0), []
     for _, data in moving(world, 4 * FORCE_STRIDE):
@@ -141,13 +128,6 @@ def test_a_delay_gives_the_reading_of_so_many_steps_ago(world, late):
         expected = fresh[max(k - late, 0)]
         assert np.array_equal(reading.q, expected.q)
         assert np.array_equal(reading.force, expected.force)
-
-
-def test_delay_does_not_change_the_noise(world, stood):
-    q, force = read_many(world, stood, 40, noise=1.0)
-    q_late, force_late = read_many(world, stood, 40, noise=1.0, delay=0.003)
-    assert np.array_equal(q_late[3:], q[:-3])
-    assert np.array_equal(force_late[3:], force[:-3])
 
 
 # Noise.
@@ -255,28 +235,6 @@ def test_forces_are_those_that_mujoco_sums_contact_by_contact(demo_plan, seed):
         pressed += np.count_nonzero(np.linalg.norm(expected, axis=1) > 1.0)
         assert np.abs(expected[:, :2]).max() > 1.0
     assert pressed >= 3 * len(demo_plan.keyframes[1:])
-
-
-def test_supports_push_and_do_not_pull(demo_plan):
-    world = demo_plan.world
-    data = mujoco.MjData(world.model)
-    data.qpos[:] = demo_plan.keyframes[-1].q
-    data.qpos[2] -= 0.002
-    mujoco.mj_forward(world.model, data)
-    force = surface_forces(data, rows_of(world), len(world.surfaces))
-    for c in demo_plan.keyframes[-1].stance:
-        f = force[list(world.surfaces).index(c.surface)]
-        assert f @ world.supports[c.support].normal > 1.0
-
-
-def test_in_the_air_nothing_is_felt(world):
-    data = mujoco.MjData(world.model)
-    data.qpos[:] = world.home
-    data.qpos[2] += 1.0
-    mujoco.mj_forward(world.model, data)
-    force = surface_forces(data, rows_of(world), len(world.surfaces))
-    assert force.shape == (len(world.surfaces), 3)
-    assert not force.any()
 
 
 def test_a_link_that_is_no_surface_is_not_felt(world):
