@@ -67,7 +67,7 @@ class Proposal:
     Attributes:
         name: Of the robot.
         mjcf: Text of its model of plain shapes.
-        files: Meshes of what is seen, by their path beside the model.
+        files: Meshes of what is seen, by their names in `MESH_FOLDER` beside the model.
         fields: Of `robot.yaml`.
         guessed: Joints whose effort limit is a guess: the description has none.
         notes: What the user should know, a sentence each.
