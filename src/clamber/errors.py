@@ -74,6 +74,8 @@ class Status(enum.Enum):
     SLIDING = "a new contact cannot support its mass within the friction cone"
     OVERLOADED = "no contact forces within the friction cones and torque limits hold it"
     STUCK = "no contact change brings the robot nearer to its goal"
+    EXHAUSTED = "every contact within the budget was tried"
+    BUDGET = "the budget of tries or seconds was spent: allow more"
 
 
 def read_yaml(path: Path) -> dict:

@@ -13,7 +13,6 @@ from clamber.model.limbs import DENSEST, geom_volume
 from clamber.model.robot import Robot
 from clamber.model.scene import Box, Scene
 from clamber.model.world import World, build_world
-from clamber.planning.planner import check_start
 from clamber.step.change import standing
 from clamber.step.ik import IK
 from clamber.step.posture import KeyframeOptions
@@ -201,3 +200,72 @@ def _holds(box: Box, points: np.ndarray) -> bool:
     """Whether all points (K, 3) are inside a box."""
     local = (points - box.position) @ box.rotation
     return bool(np.all(np.abs(local) < box.size / 2 - 1e-9))
+
+
+def check_start(ik: IK, start: Keyframe) -> None:
+    """A robot that cannot stand, or stands in a box, is the user's mistake.
+
+    Raises:
+        InputError: The robot's home posture falls over or exceeds its effort limits, or
+            a box is where it stands.
+    """
+    world = ik.world
+    depth, pair = overlap(ik, start.q, watched_pairs(world, start.stance))
+    names = (
+        [] if pair < 0 else [world.model.geom(int(g)).name for g in world.pairs[pair]]
+    )
+    boxes = [b.name for b in world.scene.boxes if b.name in names]
+    if depth > 0 and boxes:
+        raise InputError(
+            "a start where no box is: move the one or the other",
+            field="scene.start",
+            value=" and ".join(names),
+        )
+    if start.com_margin < 0 or not start.equilibrium.feasible:
+        why = f"its mass is {-1e3 * start.com_margin:.0f} mm beside its soles"
+        if start.com_margin >= 0:
+            why = limiting_joint(ik.kin, start.q, start.stance)
+        raise InputError(
+            f"a posture that stands within the effort limits ({why})",
+            field="robot.home",
+        )
+
+
+def check_reach(ik: IK) -> None:
+    """A box that no limb could touch from the start is the user's mistake.
+
+    Raises:
+        InputError: The nearest point of the first box's top is farther from where the
+            robot stands than legs, trunk and arms are long together.
+    """
+    kin, world = ik.kin, ik.world
+    kin.update(world.home)
+
+    def length(arm: bool) -> float:
+        limb = next(x for x in world.robot.limbs.values() if x.is_arm == arm)
+        a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
+        return float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
+
+    shoulder, hip = (
+        next(
+            kin.landmark(x.root)[1]
+            for x in world.robot.limbs.values()
+            if x.is_arm == arm
+        )
+        for arm in (True, False)
+    )
+    reach = length(True) + float(np.linalg.norm(shoulder - hip)) + length(False)
+    start = np.array([*world.scene.start[:2], 0.0])
+    for box in world.scene.boxes[:1]:
+        top = box.top
+        local = top.rotation.T @ (start - top.position)
+        half = top.polygon.max(axis=0)
+        nearest = np.array([*np.clip(local[:2], -half, half), 0.0])
+        distance = float(np.linalg.norm(nearest - local))
+        if distance > reach:
+            raise InputError(
+                f"the nearest point of its top within {reach:.2f} m of the start,"
+                " the robot's reach",
+                field=f"scene.boxes.{box.name}",
+                value=f"{distance:.2f} m away",
+            )

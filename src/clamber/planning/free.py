@@ -15,27 +15,23 @@ only what comes first is.
 
 from __future__ import annotations
 
-import enum
-import heapq
-import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Region, Stance, region_of
 from clamber.contact.policy import GeneralPolicy
 from clamber.contact.steps import Step, on_feet, split_moves
-from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
-from clamber.planning.records import PlanOptions, Progress, Route
-from clamber.step.change import Failure, change_contact
-from clamber.step.ik import IK
+from clamber.planning.records import Route
+from clamber.planning.search import Search
+from clamber.step.change import Failure
 from clamber.step.posture import Keyframe
 from clamber.step.stability import STANDING_SHARE, standing_share
 
@@ -51,58 +47,6 @@ UNSEEN = 0.25  # times that every action counts as seen besides
 CELL = 0.05  # [m] contacts as near to one another make the same state
 GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
 BACK_TOL = 0.30  # [m] mean of the contacts, where the way leads back to where it began
-
-
-class Stop(enum.Enum):
-    """Why a search ended: a sentence."""
-
-    FOUND = "a sequence was found"
-    EXHAUSTED = "there is no sequence within the bounds: every state was expanded"
-    TRIES = "the bound on steps to plan was reached: allow more"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Bounds:
-    """How far a search for contacts goes.
-
-    Attributes:
-        tries: Steps that it plans at most; 0: none, there is no search. A step takes
-            from a tenth of a second to two seconds.
-        depth: Moves that it adds at most.
-    """
-
-    tries: int = 100
-    depth: int = 12
-
-    def __post_init__(self) -> None:
-        """Check that they are bounds.
-
-        Raises:
-            InputError: One of them is negative.
-        """
-        for name in ("tries", "depth"):
-            if getattr(self, name) < 0:
-                value = getattr(self, name)
-                raise InputError("0 or more", field=f"search.{name}", value=value)
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Explored:
-    """What a search for contacts found.
-
-    Attributes:
-        route: What it found; where that is nothing, what it went on from.
-        sequence: Of the stances found, a robot's own; None where nothing was found.
-        states: That were expanded.
-        tries: Steps that were planned.
-        stop: Why it ended.
-    """
-
-    route: Route
-    sequence: ContactSequence | None
-    states: int
-    tries: int
-    stop: Stop
 
 
 def policy_counts(policy: GeneralPolicy) -> Counts:
@@ -131,105 +75,95 @@ def action_counts(sequence: ContactSequence, world: World) -> Counts:
     return counts
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _Action:
-    step: Step
-    price: float
-
-
-@dataclass(order=True, slots=True)
-class _Entry:
-    priority: float
-    order: int
-    route: Route = field(compare=False)
-    cost: float = field(compare=False)
-    action: _Action = field(compare=False)
-
-
-def explore(
-    ik: IK,
-    sequence: ContactSequence,
-    options: PlanOptions,
-    counts: Counts,
-    bounds: Bounds,
-    start: Route,
-    *,
-    report: Progress = lambda stage, share, note: None,
-) -> Explored:
+def search_contacts(
+    search: Search, start: Route, sequence: ContactSequence, counts: Counts
+) -> Route:
     """Search for contacts that lead to where a sequence ends.
 
     Args:
-        ik: Workspace.
+        search: That tries them.
+        start: What to go on from; it is part of what is found.
         sequence: In the robot's scene. It ends on the same supports, or at the scene's
             goal; its contacts are the first places that are tried, its postures guide
             those of like stances.
-        options: How steps are planned.
         counts: How often a demonstration takes an action.
-        bounds: How far to go.
-        start: What to go on from.
-        report: Called with stage, share and note, for progress.
     """
-    guide = _Guidance(ik.world, sequence, counts)
-    queue: list[_Entry] = []
-    order = itertools.count()
-    seen: set[frozenset] = set()
-    often: Counter[frozenset] = Counter()  # like steps that were planned
-    states = tries = 0
+    free = _Free(search, _Guidance(search.ik.world, sequence, counts), start)
+    if free.guidance.arrived(start.end):
+        return replace(start, failures=(), arrived=True)
+    most = search.budget.tries
+    entry, failure = search.best_first(free.actions(start, 0.0), most)
+    if failure is None and entry is not None:
+        return replace(entry.route, failures=(), arrived=True)
+    return replace(start, failures=() if failure is None else (failure,), arrived=False)
 
-    def expand(route: Route, cost: float) -> None:
-        for a in guide.actions(ik.kin, route.end):
-            push(route, cost, a)
 
-    def priority(route: Route, cost: float, a: _Action) -> float:
-        after = _after(route.end.stance, a.step)
-        again = AGAIN * often[_kind(after)]
-        return cost + a.price + EAGER * guide.left(after) + again
+class _Free:
+    """What the entries of one search share."""
 
-    def push(route: Route, cost: float, a: _Action) -> None:
-        rank = priority(route, cost, a)
-        heapq.heappush(queue, _Entry(rank, next(order), route, cost, a))
+    def __init__(self, search: Search, guidance: _Guidance, start: Route) -> None:
+        self.search, self.guidance, self._start = search, guidance, start
+        self.seen: set[frozenset] = set()
+        self.often: Counter[frozenset] = Counter()  # like steps that were tried
 
-    def ended(found: Route | None, stop: Stop) -> Explored:
-        return Explored(
-            route=start if found is None else found,
-            sequence=None if found is None else _as_sequence(ik.world, found),
-            states=states,
-            tries=tries,
-            stop=stop,
-        )
+    def actions(self, route: Route, cost: float) -> list[_Action]:
+        """All that may be done after a route."""
+        if len(route.changes) - len(self._start.changes) >= self.search.budget.depth:
+            return []
+        out = []
+        for step, price in self.guidance.actions(self.search.ik.kin, route.end):
+            after = _after(route.end.stance, step)
+            paid = cost + price
+            base = paid + EAGER * self.guidance.left(after)
+            out.append(_Action(self, route, paid, step, base, _key(after), _kind(after)))
+        return out
 
-    if guide.arrived(start.end):
-        return ended(replace(start, arrived=True), Stop.FOUND)
-    if bounds.depth > 0:
-        states = 1
-        expand(start, 0.0)
-    while queue:
-        if tries >= bounds.tries:
-            return ended(None, Stop.TRIES)
-        entry = heapq.heappop(queue)
-        route, action = entry.route, entry.action
-        after = _after(route.end.stance, action.step)
-        if _key(after) in seen:  # reached meanwhile, at less cost
-            continue
-        if priority(route, entry.cost, action) > entry.priority:
-            push(route, entry.cost, action)  # it is less promising than it was
-            continue
-        tries += 1
-        often[_kind(after)] += 1
-        report("explore", tries / bounds.tries, str(action.step))
-        found = change_contact(
-            ik, route.end, action.step, options.keyframe, options.method
-        )
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Action:
+    """An entry of the search: a step after a route; without one, it has arrived.
+
+    Attributes:
+        paid: For the route and the step.
+        base: That and what is left to do.
+        key, kind: Of the stance that it leads to.
+    """
+
+    free: _Free
+    route: Route
+    paid: float
+    step: Step | None
+    base: float = -math.inf
+    key: frozenset = frozenset()
+    kind: frozenset = frozenset()
+
+    @property
+    def price(self) -> float:
+        """It rises with each like step that was tried."""
+        return self.base + AGAIN * self.free.often[self.kind]
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has arrived."""
+        return self.step is None
+
+    def tried(self) -> list[_Action]:
+        """What may be done after the step, where it is possible."""
+        free, step = self.free, self.step
+        if step is None or self.key in free.seen:  # reached meanwhile, at less cost
+            return []
+        search = free.search
+        n = sum(free.often.values()) + 1
+        free.often[self.kind] += 1
+        search.report("search", n / search.budget.tries, str(step))
+        found = search.change("search", self.route.end, step)
         if isinstance(found, Failure):
-            continue
-        seen |= {_key(after), _key(found.keyframe.stance)}
-        route = replace(route, changes=(*route.changes, found))
-        if guide.arrived(route.end):
-            return ended(replace(route, arrived=True), Stop.FOUND)
-        if len(route.changes) - len(start.changes) < bounds.depth:
-            states += 1
-            expand(route, entry.cost + action.price)
-    return ended(None, Stop.EXHAUSTED)
+            return []
+        free.seen |= {self.key, _key(found.keyframe.stance)}
+        route = replace(self.route, changes=(*self.route.changes, found))
+        if free.guidance.arrived(route.end):
+            return [_Action(free, route, self.paid, None)]
+        return free.actions(route, self.paid)
 
 
 def _after(stance: Sequence[Contact], step: Step) -> tuple[Contact, ...]:
@@ -251,7 +185,7 @@ def _kind(stance: Sequence[Contact]) -> frozenset:
     return frozenset((c.surface, c.support) for c in stance)
 
 
-def _as_sequence(world: World, route: Route) -> ContactSequence:
+def sequence_of(world: World, route: Route) -> ContactSequence:
     """The stances that a route comes through, one a second.
 
     A contact is where it was made: a foot that goes on tiptoe later has not moved.
@@ -351,8 +285,8 @@ class _Guidance:
         """Whether its surface may be the one that a limb ends on."""
         return not self._stands or on_feet(self._world, [c])
 
-    def actions(self, kin: Kinematics, key: Keyframe) -> list[_Action]:
-        """All that may be done from a keyframe."""
+    def actions(self, kin: Kinematics, key: Keyframe) -> list[tuple[Step, float]]:
+        """All that may be done from a keyframe, and what it costs."""
         world = self._world
         region = region_of(key.stance)
         kin.update(key.q)
@@ -363,7 +297,7 @@ class _Guidance:
             root = kin.landmark(limb.root)[1].copy()
             if self._stands and limb.is_arm and present is not None:
                 leaves = Step(limb=limb.name, breaks=(present.surface,), makes=None)
-                out.append(_Action(step=self._aimed(key, leaves), price=self._even))
+                out.append((self._aimed(key, leaves), self._even))
             for surface in limb.surfaces:
                 for support in world.supports:
                     for c in self._contacts(surface, support, root):
@@ -379,7 +313,7 @@ class _Guidance:
                         r = float(np.linalg.norm(c.position - root))
                         stretch = max(0.0, r / self._length[surface] - 1.0)
                         price = self._surprise(region, surface) + stretch
-                        out.append(_Action(step=self._aimed(key, step), price=price))
+                        out.append((self._aimed(key, step), price))
         return out
 
     def _surprise(self, region: Region, surface: str) -> float:

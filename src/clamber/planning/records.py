@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -10,7 +10,8 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.policy import GeneralPolicy
-from clamber.contact.steps import Skipped
+from clamber.contact.steps import Skipped, Step
+from clamber.errors import InputError
 from clamber.model.records import frozen_array, short_repr
 from clamber.model.world import World
 from clamber.planning.trajectory import Trajectory
@@ -19,6 +20,13 @@ from clamber.step.methods import Method
 from clamber.step.posture import Keyframe, KeyframeOptions
 
 Progress = Callable[[str, float, str], None]
+Source = Literal["alternatives", "search", "secondary"]
+
+
+def silent(stage: str, share: float, note: str) -> None:
+    """Report progress to nobody."""
+
+
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -52,6 +60,92 @@ class Iteration:
     cost: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Budget:
+    """How much a plan may try beyond what is demonstrated.
+
+    Attributes:
+        tries: Steps that each search for other contacts plans at most; 0: none, there
+            is no search. A step takes from a tenth of a second to two seconds.
+        depth: Contact changes that it adds at most.
+        seconds: Of all that is tried, looked at between two steps; None: no bound. With
+            one, what is found depends on the machine.
+        ahead: Contact changes of a policy that are planned before it stops for more;
+            None: as far as `PlanOptions.max_changes`.
+    """
+
+    tries: int = 100
+    depth: int = 12
+    seconds: float | None = None
+    ahead: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check that nothing is less than nothing.
+
+        Raises:
+            InputError: A field is negative.
+        """
+        for name in ("tries", "depth", "seconds", "ahead"):
+            value = getattr(self, name)
+            if value is not None and not value >= 0:
+                raise InputError("0 or more", field=f"search.{name}", value=value)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Attempt:
+    """A step that was tried.
+
+    Attributes:
+        proposer: What wanted it: `demonstrated`, surfaces in place of others, `search`.
+        step: What it was.
+        failure: Why it is not possible; None: it is.
+    """
+
+    proposer: str
+    step: Step
+    failure: Failure | None
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tried:
+    """What a proposer came to; as a string, a clause.
+
+    Attributes:
+        proposer: As of `Attempt`.
+        steps: That were tried.
+        failed: Of these.
+        last: Why the last of those failed; empty where none did.
+    """
+
+    proposer: str
+    steps: int
+    failed: int
+    last: str
+
+    def __str__(self) -> str:
+        """Who tried how much."""
+        why = f", {self.failed} of them failed, the last: {self.last}"
+        return f"{self.proposer}: {self.steps} steps{why if self.failed else ''}"
+
+
+def summary(attempts: Iterable[Attempt]) -> tuple[Tried, ...]:
+    """What each proposer came to, in the order in which they were asked."""
+    by: dict[str, list[Attempt]] = {}
+    for attempt in attempts:
+        by.setdefault(attempt.proposer, []).append(attempt)
+    out = []
+    for proposer, tried in by.items():
+        failures = [a.failure for a in tried if a.failure is not None]
+        last = str(failures[-1]) if failures else ""
+        row = Tried(
+            proposer=proposer, steps=len(tried), failed=len(failures), last=last
+        )
+        out.append(row)
+    return tuple(out)
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class State:
     """Where a robot is: a plan may begin anywhere.
@@ -59,7 +153,7 @@ class State:
     Attributes:
         stance: Its contacts, each where it is.
         loaded: Those of them that bear load already.
-        q: (nq,) its posture.
+        q: (nq,) its posture, the joints as they are commanded: the way begins there.
         done: Steps of the plan's sequence that it has done.
     """
 
@@ -128,13 +222,15 @@ class Fallback:
         reason: Why not as demonstrated; empty where nothing was missed.
         source: Where the other contacts come from; None: there are none either.
         surfaces: That make them.
-        tried: What was looked at, for people.
+        detail: Where a secondary policy was followed, for people.
+        tried: All that was looked at.
     """
 
     reason: str
-    source: Literal["alternatives", "search", "secondary"] | None = None
+    source: Source | None = None
     surfaces: tuple[str, ...] = ()
-    tried: str = ""
+    detail: str = ""
+    tried: tuple[Tried, ...] = ()
 
     def __str__(self) -> str:
         """Why, and what instead."""
@@ -142,7 +238,9 @@ class Fallback:
         if self.source in how:
             used = f"instead, {how[self.source]}: {', '.join(self.surfaces)}"
             return f"{self.reason}; {used}"
-        return "; ".join(filter(None, (self.reason, self.tried)))
+        tried = "" if self.source else "; ".join(map(str, self.tried))
+        tried = f"what was tried: {tried}" if tried else ""
+        return "; ".join(filter(None, (self.reason, self.detail, tried)))
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

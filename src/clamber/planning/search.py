@@ -1,144 +1,120 @@
-"""Step after step: keyframe, transition, path; earlier contacts mended where needed.
+"""One search: contact changes are tried, what promises most first, until one arrives.
 
-Each step is planned from the keyframe before it. Where a step fails because of where an
-earlier contact lies, that contact is put where the step would have liked it, and
-planning goes on from there; where nothing helps, the step is skipped with its reason.
+What may come next is an `Entry`: a route so far, a price, and what to do for more. An
+entry that is taken from the queue is tried, and what it leads to is put into it. What is
+tried, and with what result, is noted for all searches of a plan together, and one
+budget bounds them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+import heapq
+import itertools
+import time
+from collections.abc import Iterable
+from typing import Protocol, Self, TypeVar
 
-from clamber.contact.contact import Contact
-from clamber.contact.steps import Seeds, Step
-from clamber.planning.records import PlanOptions, Progress, Route
+from clamber.contact.steps import Step
+from clamber.errors import Status
+from clamber.planning.records import (
+    Attempt,
+    Budget,
+    PlanOptions,
+    Progress,
+    silent,
+)
 from clamber.step.change import Change, Failure, change_contact
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
-from clamber.step.transition import MARGINS, eased_contacts
-
-MAX_REPAIRS = 4  # earlier contacts that may be put elsewhere for a later step's sake
 
 
-def follow_steps(
-    ik: IK,
-    start: Keyframe,
-    steps: Sequence[Step],
-    options: PlanOptions,
-    report: Progress,
-) -> Route:
-    """Plan all steps in order.
+class Entry(Protocol):
+    """What may come next in a search."""
 
-    Args:
+    @property
+    def price(self) -> float:
+        """The least is taken first; it may rise while the entry waits."""
+        ...
+
+    @property
+    def ended(self) -> bool:
+        """Nothing is left to be tried: where it is the cheapest, it is found."""
+        ...
+
+    def tried(self) -> Iterable[Self]:
+        """Try what comes next; what may come after that."""
+        ...
+
+
+E = TypeVar("E", bound=Entry)
+
+
+class Search:
+    """What the searches of one plan share.
+
+    Attributes:
         ik: Workspace.
-        start: The keyframe to begin from.
-        steps: Of the demonstration.
-        options: Of the plan.
+        options: How steps are planned.
+        budget: How much may be tried.
         report: Called with stage, share and note, for progress.
+        attempts: All that was tried, in order.
     """
-    changes: list[Change] = []
-    failures: dict[int, Failure] = {}  # by step
-    steps = list(steps)
-    done: list[int] = []  # the step that each change makes
-    mended = k = 0
-    while k < len(steps):
-        step = steps[k]
-        report("plan", k / len(steps), str(step))
-        route = Route(start=start, changes=tuple(changes))
-        found = change_contact(ik, route.end, step, options.keyframe, options.method)
-        if isinstance(found, Change):
-            done.append(k)
-            made = [found]
-            if mended < MAX_REPAIRS and found.margin < MARGINS[0]:
-                roomier = _roomier(ik, route, [steps[i] for i in done], options)
-                if roomier is not None:
-                    mended += 1
-                    j, again, made = roomier
-                    for i, changed in zip(done[j:], again, strict=True):
-                        steps[i] = changed
-                    del changes[j:]
-            changes += made
-            k += 1
-            continue
-        better = None
-        if mended < MAX_REPAIRS:
-            better = next(repairs(ik, route, step), None)
-        if better is None:
-            failures[k] = found
-            k += 1
-            continue
-        mended += 1
-        places, seeds = better
-        steps[k] = replace(step, seeds=seeds)
-        for j, contact in places.items():
-            steps[done[j]] = _placed(steps[done[j]], contact)
-        j = min(places)
-        k = done[j]
-        del changes[j:], done[j:]
-        failures = {i: f for i, f in failures.items() if i < k}
-    return Route(
-        start=start,
-        changes=tuple(changes),
-        failures=tuple(failures.values()),
-        arrived=not failures,
-    )
 
+    def __init__(
+        self,
+        ik: IK,
+        options: PlanOptions,
+        budget: Budget | None = None,
+        report: Progress = silent,
+    ) -> None:
+        """Nothing has been tried; a budget of seconds counts from now on."""
+        self.ik, self.options, self.report = ik, options, report
+        self.budget = budget or Budget()
+        self.attempts: list[Attempt] = []
+        seconds = self.budget.seconds
+        self._end = None if seconds is None else time.monotonic() + seconds
 
-def _placed(step: Step, contact: Contact) -> Step:
-    """The step, its contact made there and nowhere else."""
-    return replace(step, makes=contact, fixed=True)
+    @property
+    def late(self) -> bool:
+        """Whether the budget of seconds is spent."""
+        return self._end is not None and time.monotonic() > self._end
 
+    def change(
+        self,
+        proposer: str,
+        before: Keyframe,
+        step: Step,
+        options: PlanOptions | None = None,
+    ) -> Change | Failure:
+        """Try a step that a proposer wants, and note what came of it."""
+        how = options or self.options
+        found = change_contact(self.ik, before, step, how.keyframe, how.method)
+        failure = found if isinstance(found, Failure) else None
+        self.attempts.append(Attempt(proposer=proposer, step=step, failure=failure))
+        return found
 
-def _roomier(
-    ik: IK, route: Route, making: list[Step], options: PlanOptions
-) -> tuple[int, list[Step], list[Change]] | None:
-    """A step with the largest margin, for which earlier contacts are put elsewhere.
+    def best_first(
+        self, entries: Iterable[E], most: int | None = None
+    ) -> tuple[E | None, Failure | None]:
+        """The first entry that has ended and is the cheapest, or why there is none.
 
-    `making` holds the step of each change, and last the one to find more room for.
+        Where the budget is spent, what would have come next.
 
-    Returns:
-        The first change to be replaced, its step and those after it, and what has been
-        planned for them; None where that does not help.
-    """
-    step = making[-1]
-    for places, seeds in repairs(ik, route, step, margin=MARGINS[0]):
-        j = min(places)
-        again = [*making[j:-1], replace(step, seeds=seeds)]
-        for i, contact in places.items():
-            again[i - j] = _placed(again[i - j], contact)
-        least = [*(c.margin for c in route.changes[j:]), MARGINS[0]]
-        key, made = route.keyframes[j], []
-        for s, margin in zip(again, least, strict=True):
-            found = change_contact(ik, key, s, options.keyframe, options.method)
-            if isinstance(found, Failure) or found.margin < margin:
-                break
-            key = found.keyframe
-            made.append(found)
-        else:
-            return j, again, made
-    return None
-
-
-def repairs(
-    ik: IK, route: Route, step: Step, *, margin: float = MARGINS[-1]
-) -> Iterator[tuple[dict[int, Contact], Seeds]]:
-    """Which earlier changes should have made their contacts elsewhere for `step`.
-
-    Looks at one contact after the other, the last one first, and then at all at once.
-
-    Yields:
-        By index of the change, the contact at its better place, and the posture that
-        `step` then goes through.
-    """
-    standing_on = {c.surface for c in route.end.stance} - set(step.breaks)
-    made: dict[str, int] = {}
-    for j in range(len(route.changes) - 1, -1, -1):
-        new = route.changes[j].step.makes
-        if new is not None and new.surface in standing_on and new.surface not in made:
-            made[new.surface] = j
-    for surfaces in (*([x] for x in made), list(made)):
-        eased = eased_contacts(ik, route.end, step, surfaces, margin=margin)
-        if eased is not None:
-            contacts, seeds = eased
-            yield {made[c.surface]: c for c in contacts}, seeds
+        Args:
+            entries: To begin with.
+            most: Attempts; None: as many as it takes.
+        """
+        queue: list[tuple[float, int, E]] = []
+        order, before = itertools.count(), len(self.attempts)
+        for entry in entries:
+            heapq.heappush(queue, (entry.price, next(order), entry))
+        while queue:
+            price, _, entry = heapq.heappop(queue)
+            if entry.ended:
+                return entry, None
+            spent = most is not None and len(self.attempts) - before >= most
+            if spent or self.late:
+                return entry, Failure(status=Status.BUDGET)
+            for x in [entry] if entry.price > price else entry.tried():
+                heapq.heappush(queue, (x.price, next(order), x))
+        return None, Failure(status=Status.EXHAUSTED)
