@@ -71,7 +71,7 @@ def cross(
     }
     began = time.process_time()
     try:
-        plan = clamber.plan_traverse(policy, robot, scene)
+        plan = clamber.plan(policy, robot, scene)
     except clamber.InputError as e:
         return out | {"planned": False, "reached": False, "why": str(e)}
     spent = time.process_time() - began

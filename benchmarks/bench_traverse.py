@@ -42,7 +42,7 @@ def measure(policy: Path, length: float) -> Row:
     scene = clamber.Scene(boxes=(box,), start=np.zeros(3), goal=goal)
     robot, general = clamber.load_robot("coman"), clamber.load_policy(policy)
     clock, memory = [time.process_time()], [peak()]
-    plan = clamber.plan_traverse(general, robot, scene)
+    plan = clamber.plan(general, robot, scene)
     clock.append(time.process_time())
     memory.append(peak())
     with tempfile.TemporaryDirectory() as folder:

@@ -158,7 +158,7 @@ def crossed(folder: Path) -> dict[str, Any]:
     clamber(folder, "learn", "crossing", "--out", "policy.json")
     code = (
         "import clamber\n"
-        "p = clamber.plan_traverse(clamber.load_policy('policy.json'),"
+        "p = clamber.plan(clamber.load_policy('policy.json'),"
         " clamber.load_robot('coman'), clamber.load_scene('scene.yaml'))\n"
         "clamber.save_plan(p, 'run')\n"
     )

@@ -131,7 +131,7 @@ def fast_plan(demo_plan):
     """The same postures, as fast as joints and contacts bear."""
     from dataclasses import replace
 
-    from clamber.planning.planner import timed
+    from clamber.planning.trajectory import timed
 
     trajectory = timed(demo_plan.world, demo_plan.changes, "max")
     options = replace(demo_plan.options, speed="max")
@@ -143,7 +143,7 @@ def hands_plan(demo_plan):
     """Fast, and no more than the first two steps: both hands on the box."""
     from dataclasses import replace
 
-    from clamber.planning.planner import timed
+    from clamber.planning.trajectory import timed
 
     changes, stances = demo_plan.changes[:2], demo_plan.sequence.stances
     down = [

@@ -336,7 +336,6 @@ def quick_climb(one_hand_plan, one_hand_rollout, monkeypatch: Patch) -> SimpleNa
     for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
         note(name, getattr(clamber, name))
     note("plan", lambda *_, **__: said.plan)
-    monkeypatch.setitem(vars(clamber), "plan_or_replan", clamber.plan)
     note("simulate", lambda *_, **__: one_hand_rollout)
     note("judge", lambda *_: said.verdict)
     note("render_run", draw)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber.errors import Status
+from clamber.errors import InputError, Status
 from clamber.execution import executive
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.estimate import LOST, TOUCH
@@ -388,17 +388,11 @@ def nothing_found(monkeypatch):
     """Planning again finds no way; what it was asked for is in this list."""
     asked = []
 
-    def adapt(plan, scene, now, commanded, clearance):
-        asked.append(now)
-        failure = Failure(status=Status.UNREACHABLE, detail="no way")
-        return replace(
-            plan, changes=(), failures=(failure,), trajectory=None, complete=False
-        )
+    def nothing(*_, start, **__):
+        asked.append(start)
+        raise InputError("no way")
 
-    monkeypatch.setattr(executive, "adapt_plan", adapt)
-    monkeypatch.setattr(
-        executive, "start_again", lambda plan, scene: adapt(plan, scene, None, 0, 0)
-    )
+    monkeypatch.setattr(executive, "plan", nothing)
     return asked
 
 
@@ -498,7 +492,7 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
             complete=False,
             trajectory=timed(hands_plan.world, changes or hands_plan.changes, "max"),
         )
-        monkeypatch.setattr(executive, "adapt_plan", lambda *_, found=found: found)
+        monkeypatch.setattr(executive, "plan", lambda *_, found=found, **__: found)
         told, touch = Told(hands_plan), touch_of(hands_plan, 0)
         told.to(touch - 100)
         told.up = 1.1 * FALLBACK
@@ -653,7 +647,7 @@ def test_where_there_is_no_way_without_it_it_is_accepted(
         def again():
             return replace(demo_plan, trajectory=replace(demo_plan.trajectory))
 
-        monkeypatch.setattr(executive, "adapt_plan", lambda *_: again())
+        monkeypatch.setattr(executive, "plan", lambda *_, **__: again())
     told = Told(demo_plan)
     told.to(500)
     told.moves = False

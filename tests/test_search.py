@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -14,10 +14,11 @@ from clamber.errors import Status
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import build_world
-from clamber.planning import search
+from clamber.planning import demonstrated, search
+from clamber.planning.demonstrated import VARIATIONS, follow_steps, repairs
 from clamber.planning.planner import plan
-from clamber.planning.records import PlanOptions, Route
-from clamber.planning.search import follow_steps, repairs
+from clamber.planning.records import Budget, PlanOptions, Route, summary
+from clamber.planning.search import Search
 from clamber.step import change as change_module
 from clamber.step.change import Change, Failure, change_contact, standing
 from clamber.step.ik import IK
@@ -29,8 +30,9 @@ HEIGHT = 0.275
 
 
 def find(ik, steps):
-    start = standing(ik, OPTIONS)
-    return follow_steps(ik, start, steps, PlanOptions(), lambda *_: None)
+    """With the first weights alone."""
+    start, search = standing(ik, OPTIONS), Search(ik, PlanOptions())
+    return follow_steps(search, start, steps, variations=VARIATIONS[:1])[0]
 
 
 def surfaces(keyframe) -> set[str]:
@@ -170,7 +172,7 @@ def test_a_badly_placed_knee_is_put_elsewhere_for_the_other_ones_sake(
 ):
     bad = np.array([0.4, -0.1, HEIGHT])  # the left knee where the right one should go
     tangled = [*steps[:4], moved(steps[4], position=bad, fixed=True), steps[5]]
-    monkeypatch.setattr(search, "MAX_REPAIRS", 0)
+    monkeypatch.setattr(demonstrated, "MAX_REPAIRS", 0)
     stuck = find(ik, tangled)
     assert [str(f.step) for f in stuck.failures] == ["RFoot -> RKnee on box"]
     assert "RFoot" in surfaces(stuck.keyframes[-1])
@@ -203,7 +205,7 @@ class FakePlanner:
         self.fails, self.repairs_to, self.tried = fails, repairs_to, []
         self.margin = margin
         monkeypatch.setattr(search, "change_contact", self.change_contact)
-        monkeypatch.setattr(search, "repairs", self.repairs)
+        monkeypatch.setattr(demonstrated, "repairs", self.repairs)
 
     def change_contact(self, ik, before, step, options, method):
         name = step.limb + ("!" if step.fixed else "")
@@ -247,7 +249,7 @@ def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
         lambda limb, paths: ({0: contact}, Seeds()),
     )
     found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
-    assert fake.tried.count("b") == search.MAX_REPAIRS + 1
+    assert fake.tried.count("b") == demonstrated.MAX_REPAIRS + 1
     assert [str(f) for f in found.failures] == ["b"]
     assert found.keyframes[1:] == ("a!", "c")
 
@@ -350,6 +352,108 @@ def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkey
     for c in tried[1]:
         assert c.edge is not None
         assert c.position[0] == pytest.approx(toes, abs=1e-6)
+
+
+# The queue, the log and the budget.
+
+
+class Named:
+    """An entry that leads to others; its price may rise."""
+
+    def __init__(self, name, price, ended=False, leads_to=()):
+        self.name, self.price, self.ended = name, price, ended
+        self.leads_to, self.asked = leads_to, []
+
+    def tried(self):
+        self.asked.append(self.name)
+        return self.leads_to
+
+
+def test_the_cheapest_comes_first_and_an_end_must_be_the_cheapest_too(ik):
+    end, late = Named("end", 2.0, ended=True), Named("late", 3.0)
+    middle = Named("middle", 1.0, leads_to=[end])
+    first = Named("first", 0.0, leads_to=[Named("other", 1.5), late, middle])
+    assert Search(ik, PlanOptions()).best_first([first]) == (end, None)
+    assert middle.asked == ["middle"]
+    assert late.asked == []
+
+
+def test_what_has_become_dearer_while_it_waited_waits_on(ik):
+    end, waits = Named("end", 1.5, ended=True), Named("waits", 1.0)
+    first = Named("first", 0.0, leads_to=[end])
+    first.tried = lambda: setattr(waits, "price", 2.0) or [end]
+    assert Search(ik, PlanOptions()).best_first([first, waits])[0] is end
+    assert waits.asked == []
+
+
+def test_without_an_end_it_says_whether_all_was_tried_or_the_budget_spent(ik):
+    _, failure = Search(ik, PlanOptions()).best_first([Named("a", 0.0)])
+    assert failure.status is Status.EXHAUSTED
+    for budget, most in ((Budget(seconds=0.0), None), (Budget(), 0)):
+        entry = Named("a", 0.0)
+        found, failure = Search(ik, PlanOptions(), budget).best_first([entry], most)
+        assert found is entry
+        assert failure.status is Status.BUDGET
+        assert entry.asked == []
+
+
+def test_all_that_is_tried_is_noted_with_who_wanted_it(ik, monkeypatch):
+    FakePlanner(monkeypatch, lambda name, tried: name == "b", lambda *_: None)
+    search, (a, b, c) = (
+        Search(ik, PlanOptions()),
+        fake_steps(("a", 1), ("b", 2), ("c", 3)),
+    )
+    start = standing(ik, OPTIONS)
+    follow_steps(search, start, [a, c])
+    follow_steps(search, start, [b], "elbows", VARIATIONS[:2])
+    tried = [(x.proposer, x.step.limb, x.failure is None) for x in search.attempts]
+    assert tried == [
+        ("demonstrated", "a", True),
+        ("demonstrated", "c", True),
+        ("elbows", "b", False),
+        ("elbows", "b", False),
+    ]
+    demonstrated, elbows = summary(search.attempts)
+    assert (demonstrated.steps, demonstrated.failed, demonstrated.last) == (2, 0, "")
+    assert (elbows.proposer, elbows.steps, elbows.failed) == ("elbows", 2, 2)
+    assert elbows.last == str(search.attempts[-1].failure)
+
+
+def test_of_all_weights_the_first_that_leave_out_least_are_taken(ik, monkeypatch):
+    """One step cannot be; another one can with the third weights alone."""
+    wanted = [demonstrated.varied(PlanOptions(), f).keyframe for f in VARIATIONS]
+
+    def change(ik, before, step, options, method):
+        weights = [vars_of(w) for w in wanted].index(vars_of(options))
+        if step.limb == "no" or (step.limb == "third" and weights != 2):
+            return Failure(status=Status.COLLIDING, step=step)
+        return Change(step=step, keyframe=before, phases=(), margin=MARGINS[0])
+
+    monkeypatch.setattr(search, "change_contact", change)
+    monkeypatch.setattr(demonstrated, "repairs", lambda *a, **k: iter(()))
+    start, shared = standing(ik, OPTIONS), Search(ik, PlanOptions())
+    for names, weights, missed in (
+        (("a",), 0, 0),
+        (("a", "third"), 2, 0),
+        (("a", "third", "no"), 2, 1),
+        (("a", "no"), 0, 1),
+    ):
+        steps = fake_steps(*((n, 1) for n in names))
+        route, used = follow_steps(shared, start, steps)
+        assert vars_of(used.keyframe) == vars_of(wanted[weights])
+        assert len(route.failures) == missed
+        assert route.arrived is (missed == 0)
+
+
+def vars_of(options) -> tuple:
+    return tuple(getattr(options, f.name) for f in fields(options))
+
+
+def test_seconds_that_are_spent_leave_what_was_reached(ik, steps):
+    shared = Search(ik, PlanOptions(), Budget(seconds=0.0))
+    route, _ = follow_steps(shared, standing(ik, OPTIONS), steps)
+    assert shared.attempts == []
+    assert [f.status for f in route.failures] == [Status.BUDGET]
 
 
 def test_a_box_higher_than_flat_feet_reach_is_climbed_on_tiptoe(coman, demo_sequence):

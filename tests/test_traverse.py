@@ -15,14 +15,13 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import build_world
 from clamber.planning.gait import Gait
+from clamber.planning.planner import plan
 from clamber.planning.records import Plan, PlanOptions
 from clamber.planning.traverse import (
     PATIENCE,
     cost_to_go,
     follow,
-    follow_policy,
     followers_of,
-    plan_traverse,
     quadrupedal_posture,
 )
 from clamber.run.folder import load_plan, save_plan
@@ -53,7 +52,7 @@ def assert_contacts_are_kept(plan: Plan) -> None:
 
 @pytest.fixture(scope="module")
 def crossing() -> Plan:
-    return plan_traverse(POLICY, ROBOT, table())
+    return plan(POLICY, ROBOT, table())
 
 
 # How long it is followed: with followers that answer at once.
@@ -154,7 +153,8 @@ def test_the_posture_on_all_fours_rests_on_them_level():
 def climbing():
     """The first contacts of a flight of 0.25 m treads."""
     ik = IK(build_world(ROBOT, stairs(3, 0.15, 0.25)))
-    found = follow_policy(ik, POLICY, standing(ik, OPTIONS.keyframe), OPTIONS, 8)
+    start = standing(ik, OPTIONS.keyframe)
+    found = follow(followers_of(ik, POLICY, OPTIONS), start, 8, quiet)
     assert not found.route.failures
     return ik, found.route
 
@@ -195,41 +195,41 @@ def test_a_limb_that_goes_up_does_not_graze_the_riser_of_its_tread(climbing):
     ("steps", "rise", "tread"), [(3, 0.1, 0.4), (6, 0.15, 0.25), (2, 0.08, 0.25)]
 )
 def test_stairs_are_climbed_until_all_weight_is_on_the_last(steps, rise, tread):
-    plan = plan_traverse(POLICY, ROBOT, stairs(steps, rise, tread))
-    assert plan.complete, plan.failures
-    assert {c.support for c in plan.keyframes[-1].stance} == {f"s{steps}"}
-    used = {c.support for k in plan.keyframes for c in k.stance}
+    found = plan(POLICY, ROBOT, stairs(steps, rise, tread))
+    assert found.complete, found.failures
+    assert {c.support for c in found.keyframes[-1].stance} == {f"s{steps}"}
+    used = {c.support for k in found.keyframes for c in k.stance}
     assert used == {GROUND, *(f"s{i + 1}" for i in range(steps))}
-    assert_contacts_are_kept(plan)
+    assert_contacts_are_kept(found)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gap", [0.1, 0.3])
 def test_a_gap_between_boxes_is_crossed_on_top(gap):
     scene = row(gap, 0.6, 0.6)
-    plan = plan_traverse(POLICY, ROBOT, scene)
-    assert plan.complete, plan.failures
-    assert all(c.support == GROUND for c in plan.keyframes[-1].stance)
-    assert plan.keyframes[-1].q[0] > 1.43 + gap
+    found = plan(POLICY, ROBOT, scene)
+    assert found.complete, found.failures
+    assert all(c.support == GROUND for c in found.keyframes[-1].stance)
+    assert found.keyframes[-1].q[0] > 1.43 + gap
     tops = {b.name: b.top for b in scene.boxes}
-    supports = [{c.support for c in k.stance} for k in plan.keyframes]
+    supports = [{c.support for c in k.stance} for k in found.keyframes]
     up, down = supports.index({"b1"}), supports.index({"b2"})
     assert up < down
     assert not any(GROUND in s for s in supports[up:down])
-    for c in (c for k in plan.keyframes[up:down] for c in k.stance):
+    for c in (c for k in found.keyframes[up:down] for c in k.stance):
         assert tops[c.support].inside(c.position, 0.01)
-    assert_contacts_are_kept(plan)
+    assert_contacts_are_kept(found)
 
 
 @pytest.mark.slow
 def test_on_bare_ground_it_steps_to_the_goal_and_stands():
     bare = Scene(start=np.zeros(3), goal=np.array([0.3, 0.1, 0.5]))
-    plan = plan_traverse(POLICY, ROBOT, bare)
-    assert plan.complete
-    last = plan.keyframes[-1]
+    found = plan(POLICY, ROBOT, bare)
+    assert found.complete
+    last = found.keyframes[-1]
     assert {c.surface for c in last.stance} == set(FEET)
     assert np.linalg.norm(last.q[:2] - [0.3, 0.1]) < 0.1
-    assert {i.option for i in plan.iterations} == {"ac4"}
+    assert {i.option for i in found.iterations} == {"ac4"}
 
 
 @pytest.mark.slow
@@ -261,7 +261,7 @@ def followed_from(ik: IK, q: np.ndarray, stance: tuple[Contact, ...], changes: i
     """From a posture that is stable on some contacts."""
     task = KeyframeTask(held=stance, new=(), q_reference=q)
     key = direct(ik, task, q, OPTIONS.keyframe)
-    found = follow_policy(ik, POLICY, key, OPTIONS, changes)
+    found = follow(followers_of(ik, POLICY, OPTIONS), key, changes, quiet)
     assert not found.route.failures
     return found.route
 

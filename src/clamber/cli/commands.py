@@ -225,7 +225,6 @@ class ReplanCommand:
         return self._ranked() if self.begin is None else self._rest(self.begin)
 
     def _ranked(self) -> int:
-        from clamber.planning.substitutes import described
         from clamber.run.folder import save_replanned
 
         sequence = clamber.load_sequence(self.source)
@@ -257,7 +256,8 @@ class ReplanCommand:
                 "" if r.stable else outcome(r.plan),
             )
         stable = found.best.stable
-        note = "the best one is planned" if stable else described(found)
+        tried = "; ".join(map(str, found.tried))
+        note = "the best one is planned" if stable else f"none is stable: {tried}"
         self.output.show({}, table, note=closing(note, folder, stable))
         return REACHED if found.best.stable else MISSED
 
@@ -274,7 +274,15 @@ class ReplanCommand:
         with self.output.progress() as report, self.world.blamed():
             report("replan", 0.0, "")
             now = clamber.state_of(made, scene, q, touching, source=begin)
-            plan = clamber.replan_rest(made, now, scene, **others, progress=report)
+            plan = clamber.plan(
+                made.policy or made.sequence,
+                made.world.robot,
+                scene,
+                start=now,
+                options=made.options,
+                **others,
+                progress=report,
+            )
             folder = clamber.new_run_folder(self.out, "replan")
             clamber.save_sequence(plan.sequence, folder / "sequence.json")
             clamber.save_plan(plan, folder)
@@ -328,7 +336,7 @@ class TraverseCommand:
         with self.output.progress() as show:
             report = clock.watching(show)
             with world.blamed():
-                plan = clamber.plan_traverse(
+                plan = clamber.plan(
                     policy, robot, scene, options=options, progress=report
                 )
             folder = clamber.new_run_folder(self.out, "traverse")
@@ -460,16 +468,15 @@ def _plan(
 ) -> clamber.Plan:
     """Plan and save; `others`: how others are looked for where the shown ones fail."""
     options = clamber.PlanOptions(**asdict(flags))
-    world = (sequence, robot, scene)
-    if others is None:
-        result = clamber.plan(*world, options=options, progress=report)
-    else:
-        result = clamber.plan_or_replan(
-            *world,
-            options=options,
-            **others,
-            progress=report,
-        )
+    result = clamber.plan(
+        sequence,
+        robot,
+        scene,
+        options=options,
+        contacts="demonstrated" if others is None else "any",
+        **(others or {}),
+        progress=report,
+    )
     report("save", 0.0, "")
     clamber.save_plan(result, folder)
     report("save", 1.0, "")

@@ -106,10 +106,14 @@ class PlanningFlags:
 class SearchFlags:
     """How far to look for contacts that nobody demonstrated."""
 
-    tries: int = default_of("planning.free", "Bounds", "tries")
+    tries: int = default_of("planning.records", "Budget", "tries")
     """Steps that are planned at most; 0: no search."""
-    depth: int = default_of("planning.free", "Bounds", "depth")
-    """Moves of a sequence at most."""
+    depth: int = default_of("planning.records", "Budget", "depth")
+    """Contact changes of a sequence at most."""
+    seconds: Annotated[
+        float | None, tyro.conf.arg(help_behavior_hint="(default: no bound)")
+    ] = None
+    """Of all planning; with a bound, what is found depends on the machine."""
     policy: Annotated[
         Path | None,
         tyro.conf.arg(help_behavior_hint="(default: the sequence's own)"),
@@ -118,11 +122,13 @@ class SearchFlags:
 
     def read(self) -> dict[str, Any]:
         """The arguments of the functions that search."""
-        return {"bounds": self._bounds(), "counts": self._counts()}
+        return {"budget": self._budget(), "counts": self._counts()}
 
-    def _bounds(self) -> clamber.Bounds:
+    def _budget(self) -> clamber.Budget:
         try:
-            return clamber.Bounds(tries=self.tries, depth=self.depth)
+            return clamber.Budget(
+                tries=self.tries, depth=self.depth, seconds=self.seconds
+            )
         except InputError as e:
             source = f"--{e.field}"
             raise InputError(e.expected, source=source, value=e.value) from e

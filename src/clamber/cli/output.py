@@ -200,7 +200,7 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
         )
     return {
         "complete": plan.complete,
-        "fallback": None if plan.fallback is None else str(plan.fallback),
+        "fallback": None if plan.fallback is None else asdict(plan.fallback),
         "keyframes": keyframes,
         "skipped": [asdict(s) for s in plan.skipped],
         "failures": [str(f) for f in plan.failures],

@@ -19,7 +19,8 @@ from clamber.execution.terrain import believed_scene
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import PHYSICS_STEP, World
-from clamber.planning.adaptation import REACH, felt_contact
+from clamber.planning.adaptation import REACH
+from clamber.planning.start import measured_contact
 
 TOUCH = 10.0  # [N] normal force that is a contact
 LOST = 1.5  # [N] a contact of the stance that carries less is lost
@@ -122,7 +123,7 @@ class Estimate:
     def measured(self, c: Contact) -> Contact:
         """The contact where it is."""
         self.kin.update(self.q)
-        return felt_contact(self.kin, c)
+        return measured_contact(self.kin, c)
 
     def remember(self, contacts: Sequence[Contact], done: int) -> None:
         """Keep where supports were measured, one place for each contact made.

@@ -27,6 +27,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.contact.steps import split_moves
+from clamber.errors import InputError, Status
 from clamber.execution.balance import Balance
 from clamber.execution.estimate import LOST, TOUCH, Estimate
 from clamber.execution.events import (
@@ -53,17 +54,16 @@ from clamber.execution.unintended import (
     loaded_link,
     nearest_of,
 )
+from clamber.model.scene import Scene
 from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, limb_links
-from clamber.planning.adaptation import (
-    REACH,
-    adapt_plan,
-    feeling,
-    go_on,
-    start_again,
-)
-from clamber.planning.records import Plan, State
+from clamber.planning.adaptation import REACH, feeling
+from clamber.planning.planner import plan
+from clamber.planning.records import Budget, Plan, State
 from clamber.planning.trajectory import HOLD_END, HOLD_START, Trajectory
+from clamber.step.change import Failure
+from clamber.step.ik import NO_EXTRA
+from clamber.step.posture import Keyframe
 
 DEVIATION = 0.006  # [m] along the normal: the rest is planned again
 DRIFT = 0.015  # [m] along the support: the rest is planned again
@@ -72,6 +72,7 @@ ARM = 0.3  # [m] of it, by which a turn of the start counts
 MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 1.0  # [s] the robot stands still while the rest is planned again
+HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 UNINTENDED = 0.1  # [s] a link is loaded for so long where it should not be: it is
@@ -297,7 +298,7 @@ class Executive:
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
         key = self._keyframes[-1]
-        found = go_on(self._plan, self.estimate.world, key, self._clearance)
+        found = self._planned(self.estimate.world.scene, key)
         if found.trajectory is None:
             self._goes_on = False
             if found.failures:
@@ -329,7 +330,7 @@ class Executive:
             return
         self._note(StartsElsewhere, distance=away, yaw=yaw)
         scene = replace(world.scene, start=np.array([*xy, theta + yaw]))
-        found = start_again(self._plan, scene)
+        found = self._planned(scene, None, off)
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
@@ -475,9 +476,35 @@ class Executive:
             done=self.done,
         )
         scene = estimate.scene(self._plan.world.scene)
-        found = adapt_plan(self._plan, scene, now, self.reference, self._clearance)
+        found = self._planned(scene, now, off)
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
+
+    def _planned(
+        self, scene: Scene, start: State | Keyframe | None, off: float = 0.0
+    ) -> Plan:
+        """What is left to do, in the scene as it is believed to be.
+
+        Where contacts are so far `off` that the plan at hand will not do, other ones
+        than the demonstrated may.
+        """
+        p = self._plan
+        try:
+            return plan(
+                p.policy or p.sequence,
+                p.world.robot,
+                scene,
+                start=start,
+                options=p.options,
+                contacts="any" if off >= FALLBACK else "demonstrated",
+                budget=Budget(ahead=HORIZON),
+                clearance=NO_EXTRA if start is None else self._clearance,
+            )
+        except InputError as e:
+            failure = Failure(status=Status.UNREACHABLE, detail=str(e))
+            return replace(
+                p, changes=(), failures=(failure,), trajectory=None, complete=False
+            )
 
     def _follow(self, found: Plan, off: float) -> Ticks:
         """Go by another plan; or, where that is worse, by the one at hand."""

@@ -15,7 +15,9 @@ from clamber.model.scene import Box, Scene
 from clamber.model.world import World, build_world
 from clamber.step.change import standing
 from clamber.step.ik import IK
-from clamber.step.posture import KeyframeOptions
+from clamber.step.path import overlap, watched_pairs
+from clamber.step.posture import Keyframe, KeyframeOptions
+from clamber.step.stability import limiting_joint
 
 LEVEL = np.radians(2.0)  # soles as the robot stands
 SAME_HEIGHT = 0.005  # [m] of both soles
@@ -240,28 +242,16 @@ def check_reach(ik: IK) -> None:
     """
     kin, world = ik.kin, ik.world
     kin.update(world.home)
-
-    def length(arm: bool) -> float:
-        limb = next(x for x in world.robot.limbs.values() if x.is_arm == arm)
-        a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
-        return float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
-
+    limbs = world.robot.limbs.values()
     shoulder, hip = (
-        next(
-            kin.landmark(x.root)[1]
-            for x in world.robot.limbs.values()
-            if x.is_arm == arm
-        )
+        next(kin.landmark(x.root)[1] for x in limbs if x.is_arm == arm)
         for arm in (True, False)
     )
-    reach = length(True) + float(np.linalg.norm(shoulder - hip)) + length(False)
+    trunk = float(np.linalg.norm(shoulder - hip))
+    reach = trunk + sum(limb_lengths(kin).values())
     start = np.array([*world.scene.start[:2], 0.0])
     for box in world.scene.boxes[:1]:
-        top = box.top
-        local = top.rotation.T @ (start - top.position)
-        half = top.polygon.max(axis=0)
-        nearest = np.array([*np.clip(local[:2], -half, half), 0.0])
-        distance = float(np.linalg.norm(nearest - local))
+        distance = float(np.linalg.norm(box.top.nearest(start) - start))
         if distance > reach:
             raise InputError(
                 f"the nearest point of its top within {reach:.2f} m of the start,"

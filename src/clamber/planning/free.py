@@ -115,7 +115,9 @@ class _Free:
             after = _after(route.end.stance, step)
             paid = cost + price
             base = paid + EAGER * self.guidance.left(after)
-            out.append(_Action(self, route, paid, step, base, _key(after), _kind(after)))
+            out.append(
+                _Action(self, route, paid, step, base, _key(after), _kind(after))
+            )
         return out
 
 

@@ -1,145 +1,413 @@
-"""plan(): a contact sequence becomes a trajectory, stage by stage.
+"""A contact sequence or a policy becomes a trajectory, from wherever the robot is.
 
-sequence -> robot's scale -> moves -> keyframes -> transitions -> paths -> trajectory
+sequence -> robot's scale -> steps -> contact changes -> trajectory
+
+A sequence is planned as it was demonstrated; where that does not lead to its end, with
+other surfaces of the same limbs (`substitutes`): the best of the alternatives; elbows
+in place of hands; contacts that are searched for (`free`), from where the plan that
+came farthest is stuck, and from the start. A policy proposes contacts by itself.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from clamber.contact.contact import ContactSequence
+from clamber.contact.contact import ContactSequence, Stance
+from clamber.contact.policy import GeneralPolicy
 from clamber.contact.scaling import retarget
-from clamber.contact.steps import Step, split_moves
-from clamber.errors import InputError
+from clamber.contact.steps import split_moves
+from clamber.errors import InputError, Status
+from clamber.model.records import short_repr
 from clamber.model.robot import Robot
 from clamber.model.scene import Scene
-from clamber.model.world import World, build_world
-from clamber.planning.records import Plan, PlanOptions, Progress, Route
-from clamber.planning.search import follow_steps
-from clamber.planning.trajectory import Trajectory, build_trajectory
-from clamber.step.change import Change, standing
-from clamber.step.ik import IK
-from clamber.step.path import Phase, overlap, watched_pairs
-from clamber.step.posture import Keyframe
-from clamber.step.stability import limiting_joint
-
-# Where a step is missed, the search begins again with other weights of the keyframes:
-# they lead it to other contacts, from which there may be a way. The default is first.
-VARIATIONS: tuple[dict[str, float], ...] = (
-    {},
-    {"stability_weight": 2.0},
-    {"direction_weight": 2.0},
-    {"reference_weight": 2.0},
-    {"reference_weight": 0.5},
-    {"stability_weight": 4.0},
-    {"balance_margin": 1.4},
+from clamber.model.world import build_world
+from clamber.planning.demonstrated import VARIATIONS, follow_steps
+from clamber.planning.diagnose import check_reach, check_start
+from clamber.planning.free import Counts, action_counts, search_contacts, sequence_of
+from clamber.planning.records import (
+    Budget,
+    Fallback,
+    Plan,
+    PlanOptions,
+    Progress,
+    Route,
+    Source,
+    State,
+    Tried,
+    numbered,
+    silent,
+    summary,
 )
+from clamber.planning.search import Search
+from clamber.planning.start import from_here, from_standing, settle, steps_done
+from clamber.planning.substitutes import (
+    contact_alternatives,
+    contact_differences,
+    plan_cost,
+    stand_ins,
+)
+from clamber.planning.trajectory import timed
+from clamber.planning.traverse import follow, followers_of
+from clamber.step.change import Failure, standing
+from clamber.step.ik import IK, NO_EXTRA, ExtraClearance
+from clamber.step.path import Phase
+from clamber.step.posture import Keyframe
+
+Start = State | Keyframe
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Ranked:
+    """A planned alternative.
+
+    Attributes:
+        surfaces: By which its limbs differ; for a plan that was searched for, those
+            that make contacts, in order.
+        source: Where the contacts come from.
+        plan: As far as it goes.
+        cost: Way to the contacts and their projected distances, summed [m].
+    """
+
+    surfaces: tuple[str, ...]
+    source: Source
+    plan: Plan
+    cost: float
+
+    __repr__ = short_repr
+
+    @property
+    def stable(self) -> bool:
+        """Every step has a stable posture and a path."""
+        return self.plan.complete
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Replanned:
+    """What there is besides the demonstrated contacts.
+
+    Attributes:
+        differences: Surfaces of each stance after the first that the first has not.
+        ranked: The best first.
+        tried: What it took.
+    """
+
+    differences: tuple[tuple[str, ...], ...]
+    ranked: tuple[Ranked, ...]
+    tried: tuple[Tried, ...]
+
+    __repr__ = short_repr
+
+    @property
+    def best(self) -> Ranked:
+        """The first one."""
+        return self.ranked[0]
 
 
 def plan(
+    goal: ContactSequence | GeneralPolicy,
+    robot: Robot,
+    scene: Scene,
+    *,
+    start: Start | None = None,
+    options: PlanOptions | None = None,
+    contacts: Literal["any", "demonstrated"] = "any",
+    budget: Budget | None = None,
+    counts: Counts | None = None,
+    clearance: ExtraClearance = NO_EXTRA,
+    progress: Progress | None = None,
+) -> Plan:
+    """Plan the whole motion, or what is left of it.
+
+    Args:
+        goal: What a person has done; or a policy, which leads to the scene's goal.
+        robot: Robot.
+        scene: Where it is; from the middle of a climb, as it is believed to be.
+        start: Where the robot is, in the middle of a climb, or the keyframe to go on
+            from; None: it stands where the scene says. From the middle, where there is
+            no way at the distance that roughness or `clearance` asks for, that is not
+            kept.
+        options: How it is planned.
+        contacts: `any`: others where the demonstrated ones do not lead to the end;
+            `Plan.fallback` says which, or what was tried.
+        budget: How much is tried for others.
+        counts: How often a demonstration takes an action, which others are searched
+            for by; None: as often as this one.
+        clearance: How much farther parts stay from supports, see `IK`.
+        progress: Called with stage, share and note.
+
+    Raises:
+        InputError: The scene does not fit the sequence or the policy, or is out of the
+            robot's reach; the robot cannot stand there.
+    """
+    options = options or PlanOptions()
+    if options.speed != "max" and not options.speed > 0:
+        raise InputError(
+            "a positive joint speed [rad/s], or max", field="speed", value=options.speed
+        )
+    report, budget = progress or silent, budget or Budget()
+
+    def task(scene: Scene, clearance: ExtraClearance) -> _Task:
+        ik = IK(build_world(robot, scene), clearance)
+        return _Task(goal, Search(ik, options, budget, report), start, counts)
+
+    here = task(scene, clearance)
+    found = here.asked_for()
+    rough = any(b.roughness > 0 for b in scene.boxes)
+    if found.failures and start is not None and (clearance or rough):
+        boxes = tuple(replace(b, roughness=0.0) for b in scene.boxes)
+        nearer = task(replace(scene, boxes=boxes), NO_EXTRA)
+        other = nearer.asked_for()
+        if not other.failures or len(other.changes) > len(found.changes):
+            here, found = nearer, other
+    if contacts == "any" and found.failures:
+        found = here.fallback(found)
+    return here.timed(found)
+
+
+def replan(
     sequence: ContactSequence,
     robot: Robot,
     scene: Scene,
     *,
     options: PlanOptions | None = None,
+    budget: Budget | None = None,
+    counts: Counts | None = None,
     progress: Progress | None = None,
-) -> Plan:
-    """Plan the whole motion.
+) -> Replanned:
+    """Plan every alternative and rank them; search where none is stable.
+
+    Args:
+        sequence: As demonstrated.
+        robot: Robot.
+        scene: Where it climbs.
+        options: How each is planned.
+        budget: Of the search.
+        counts: As in `plan`.
+        progress: Called with stage, share and note.
 
     Raises:
         InputError: The scene does not fit the sequence, or is out of the robot's reach.
     """
-    options = options or PlanOptions()
-    report = progress or (lambda stage, share, note: None)
-    if options.speed != "max" and not options.speed > 0:
-        raise InputError(
-            "a positive joint speed [rad/s], or max", field="speed", value=options.speed
-        )
-    clock = _Clock()
-    world = build_world(robot, scene)
-    ik = IK(world)
-    check_reach(ik)
-    start = standing(ik, options.keyframe)
-    check_start(ik, start)
-    goal = retarget(sequence, world)
-    clock.lap("retarget")
-
-    steps, skipped = split_moves(goal, world)
-    found, used = search_steps(ik, start, steps, options, report)
-    clock.lap("search")
-    report("trajectory", 1.0, "")
-    trajectory = timed(world, found.changes, options.speed)
-    clock.lap("trajectory")
-    return Plan(
-        world=world,
-        options=used,
-        sequence=goal,
-        start=found.start,
-        changes=found.changes,
-        skipped=tuple(skipped),
-        failures=found.failures,
-        trajectory=trajectory,
-        complete=found.arrived and bool(found.changes),
-        timings=clock.laps,
+    ik = IK(build_world(robot, scene))
+    search = Search(ik, options or PlanOptions(), budget, progress or silent)
+    task = _Task(sequence, search, None, counts)
+    ranked = [replace(r, plan=task.timed(r.plan)) for r in task.ranked(None)]
+    return Replanned(
+        differences=contact_differences(sequence),
+        ranked=tuple(ranked),
+        tried=summary(search.attempts),
     )
 
 
-def search_steps(
-    ik: IK,
-    start: Keyframe,
-    steps: Sequence[Step],
-    options: PlanOptions,
-    report: Progress = lambda stage, share, note: None,
-) -> tuple[Route, PlanOptions]:
-    """What the search finds with the weights that lead it farthest, and those.
+class _Task:
+    """What is to be planned in one world, and where it begins.
 
-    Args:
-        ik: Workspace.
-        start: The keyframe to begin from.
-        steps: To plan, in order.
-        options: Of the plan; `VARIATIONS` of its weights are tried where it is stuck.
-        report: Called with stage, share and note, for progress.
+    Its plans have no trajectory until one of them is chosen (`timed`).
     """
-    found, used = None, options
-    for factors in VARIATIONS:
-        weights = {k: f * getattr(options.keyframe, k) for k, f in factors.items()}
-        varied = replace(options, keyframe=replace(options.keyframe, **weights))
-        trial = follow_steps(ik, start, steps, varied, report)
-        if found is None or len(trial.failures) < len(found.failures):
-            found, used = trial, varied
-        if found.arrived:
-            break
-    assert found is not None
-    return found, used
+
+    def __init__(
+        self,
+        goal: ContactSequence | GeneralPolicy,
+        search: Search,
+        start: Start | None,
+        counts: Counts | None,
+    ) -> None:
+        """Stand up, or settle in the stance as it is."""
+        self._goal, self._search, self._counts = goal, search, counts
+        self._ik, self._options = search.ik, search.options
+        self._state = start if isinstance(start, State) else None
+        self._from_standing = start is None
+        self._lead: tuple[Phase, ...] = ()
+        self._unsettled: tuple[Failure, ...] = ()
+        self._clock = _Clock()
+        if isinstance(start, State):
+            self._start, self._lead = settle(self._ik, start, self._options)
+            status = self._start.status
+            if status is not Status.SOLVED:
+                why = f"no stable posture here: {status.value}"
+                self._unsettled = (Failure(status=status, detail=why),)
+        elif start is not None:
+            self._start = start
+        else:
+            if isinstance(goal, ContactSequence):
+                check_reach(self._ik)
+            self._start = standing(self._ik, self._options.keyframe)
+            check_start(self._ik, self._start)
+
+    def asked_for(self) -> Plan:
+        """As demonstrated, or as the policy has it."""
+        if isinstance(self._goal, GeneralPolicy):
+            return self._followed(self._goal)
+        return self._planned(self._goal)
+
+    def timed(self, found: Plan) -> Plan:
+        """A plan with its trajectory."""
+        self._search.report("trajectory", 1.0, "")
+        self._clock.lap("search")
+        speed = self._options.speed
+        trajectory = timed(found.world, found.changes, speed, self._lead)
+        self._clock.lap("trajectory")
+        return replace(found, trajectory=trajectory, timings={**self._clock.laps})
+
+    def _plan(
+        self, sequence: ContactSequence, route: Route, state: State | None
+    ) -> Plan:
+        moves = bool(route.changes) or not self._from_standing
+        return Plan(
+            world=self._ik.world,
+            options=self._options,
+            sequence=sequence,
+            start=route.start,
+            changes=route.changes,
+            failures=route.failures,
+            trajectory=None,
+            complete=route.arrived and moves,
+            state=state,
+        )
+
+    def _planned(
+        self,
+        sequence: ContactSequence,
+        proposer: str = "demonstrated",
+        weights: int | None = None,
+    ) -> Plan:
+        """The steps of a sequence that are left, with so many of the weights."""
+        world, state = self._ik.world, self._state
+        goal = retarget(sequence, world)
+        steps, skipped = split_moves(goal, world)
+        if state is not None:
+            if proposer != "demonstrated":
+                done = steps_done(goal, steps, state.stance, world)
+                state = replace(state, done=done)
+            steps, skipped = from_here(steps[state.done :], state.stance, world), []
+        if self._unsettled:
+            route = Route(start=self._start, failures=self._unsettled)
+            return self._plan(goal, route, state)
+        variations = VARIATIONS[:weights]
+        route, used = follow_steps(
+            self._search, self._start, steps, proposer, variations
+        )
+        found = self._plan(goal, route, state)
+        return replace(found, options=used, skipped=tuple(skipped))
+
+    def _followed(self, policy: GeneralPolicy) -> Plan:
+        """A policy from the stance that the robot is in."""
+        options, search = self._options, self._search
+        followers = followers_of(self._ik, policy, options)
+        if self._from_standing:
+            followers[0].gait.check_route()
+        most, ahead = options.max_changes, search.budget.ahead
+        most = 0 if self._unsettled else most if ahead is None else ahead
+        found = follow(followers, self._start, most, search.report)
+        stances = tuple(Stance(contacts=k.stance) for k in found.route.keyframes)
+        sequence = ContactSequence(
+            source="; ".join(policy.sources) or "a policy",
+            subject=None,
+            scene=self._ik.world.scene,
+            stances=stances,
+            t=np.arange(len(stances) + 1.0),
+        )
+        failures = (*self._unsettled, *found.route.failures)
+        changes = numbered(found.route.changes)
+        route = replace(found.route, changes=changes, failures=failures)
+        return replace(
+            self._plan(sequence, route, self._state),
+            fallback=found.fallback,
+            policy=policy,
+            iterations=found.iterations,
+        )
+
+    def fallback(self, first: Plan) -> Plan:
+        """The best of other contacts; else `first`, and what was tried."""
+        if isinstance(self._goal, GeneralPolicy) or self._unsettled:
+            return first  # a policy has its own; and without a stance there is nothing
+        reason = f"no stable plan as demonstrated ({first.failures[0]})"
+        best = self.ranked(first)[0]
+        tried = summary(self._search.attempts)
+        if not best.stable:
+            return replace(first, fallback=Fallback(reason=reason, tried=tried))
+        fallback = Fallback(
+            reason=reason, source=best.source, surfaces=best.surfaces, tried=tried
+        )
+        return replace(best.plan, fallback=fallback)
+
+    def ranked(self, first: Plan | None) -> list[Ranked]:
+        """Alternatives; where none is stable, stand-ins; then what the search finds.
+
+        What is stable comes first, by cost; equal ones as they were planned.
+
+        Args:
+            first: The plan of the demonstrated contacts, where there is one. Where no
+                limb offers several surfaces, that is the only alternative.
+        """
+        out = list(self._others(first))
+        return sorted(out, key=lambda r: (not r.stable, r.cost))
+
+    def _others(self, first: Plan | None) -> Iterator[Ranked]:
+        sequence, robot = self._goal, self._ik.world.robot
+        assert isinstance(sequence, ContactSequence)
+        planned = []
+        for a in contact_alternatives(sequence, robot):
+            found = None if a.surfaces else first
+            name = ", ".join(a.surfaces) or "demonstrated"
+            planned.append(found or self._planned(a.sequence, name))
+            yield _ranked(a.surfaces, "alternatives", planned[-1])
+        if any(p.complete for p in planned):
+            return
+        for a in stand_ins(sequence, robot):
+            name = ", ".join(a.surfaces)
+            planned.append(self._planned(a.sequence, name, 1))
+            yield _ranked(a.surfaces, "alternatives", planned[-1])
+            if planned[-1].complete:
+                return
+        if self._search.budget.tries > 0:
+            yield from self._searched(planned)
+
+    def _searched(self, made: Sequence[Plan]) -> Iterator[Ranked]:
+        """What is found from where the farthest plan is stuck, or from the start."""
+        assert isinstance(self._goal, ContactSequence)
+        goal = retarget(self._goal, self._ik.world)
+        counts = self._counts
+        if counts is None:
+            counts = action_counts(goal, self._ik.world)
+        stuck = max(map(_before_failure, made), key=lambda x: len(x.changes))
+        begin = Route(start=self._start)
+        for start in (stuck, begin) if stuck.changes else (begin,):
+            route = search_contacts(self._search, start, goal, counts)
+            if route.arrived:
+                found = self._searched_for(route)
+                makes = [c.step.makes for c in found.changes]
+                surfaces = tuple(c.surface for c in makes if c is not None)
+                yield _ranked(surfaces, "search", found)
+                return
+
+    def _searched_for(self, route: Route) -> Plan:
+        """The plan of contacts that were searched for, with a sequence of its own."""
+        sequence, state, k = sequence_of(self._ik.world, route), self._state, 0
+        if state is not None:
+            sequence, k = from_standing(self._ik, sequence, self._options)
+            state = replace(state, done=k)
+        first = len(sequence.stances) - len(route.changes)
+        route = replace(route, changes=numbered(route.changes, k, first))
+        return self._plan(sequence, route, state)
 
 
-def timed(
-    world: World,
-    changes: Sequence[Change],
-    speed: float | Literal["max"],
-    lead: Sequence[Phase] = (),
-) -> Trajectory | None:
-    """The trajectory of `lead`, which leads to the first keyframe, and the changes.
+def _ranked(surfaces: tuple[str, ...], source: Source, found: Plan) -> Ranked:
+    return Ranked(surfaces=surfaces, source=source, plan=found, cost=plan_cost(found))
 
-    Args:
-        world: Robot and scene.
-        changes: One after the other.
-        speed: Largest joint speed [rad/s], or `max`.
-        lead: Phases before the first change.
 
-    Returns:
-        None where nothing moves.
-    """
-    phases = [*lead, *(p for change in changes for p in change.phases)]
-    if not phases:
-        return None
-    ends = np.cumsum([len(lead), *(len(change.phases) for change in changes)])
-    return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
+def _before_failure(made: Plan) -> Route:
+    """What a plan does before the first step that it misses."""
+    steps = [f.step for f in made.failures if f.step is not None]
+    first = min((s.index for s in steps if s.index is not None), default=math.inf)
+    changes = [c for c in made.changes if (c.step.index or 0) < first]
+    return Route(start=made.start, changes=tuple(changes))
 
 
 class _Clock:
@@ -153,72 +421,3 @@ class _Clock:
         now = time.perf_counter()
         self.laps[stage] = self.laps.get(stage, 0.0) + now - self._last
         self._last = now
-
-
-def check_start(ik: IK, start: Keyframe) -> None:
-    """A robot that cannot stand, or stands in a box, is the user's mistake.
-
-    Raises:
-        InputError: The robot's home posture falls over or exceeds its effort limits, or
-            a box is where it stands.
-    """
-    world = ik.world
-    depth, pair = overlap(ik, start.q, watched_pairs(world, start.stance))
-    names = (
-        [] if pair < 0 else [world.model.geom(int(g)).name for g in world.pairs[pair]]
-    )
-    boxes = [b.name for b in world.scene.boxes if b.name in names]
-    if depth > 0 and boxes:
-        raise InputError(
-            "a start where no box is: move the one or the other",
-            field="scene.start",
-            value=" and ".join(names),
-        )
-    if start.com_margin < 0 or not start.equilibrium.feasible:
-        why = f"its mass is {-1e3 * start.com_margin:.0f} mm beside its soles"
-        if start.com_margin >= 0:
-            why = limiting_joint(ik.kin, start.q, start.stance)
-        raise InputError(
-            f"a posture that stands within the effort limits ({why})",
-            field="robot.home",
-        )
-
-
-def check_reach(ik: IK) -> None:
-    """A box that no limb could touch from the start is the user's mistake.
-
-    Raises:
-        InputError: The nearest point of the first box's top is farther from where the
-            robot stands than legs, trunk and arms are long together.
-    """
-    kin, world = ik.kin, ik.world
-    kin.update(world.home)
-
-    def length(arm: bool) -> float:
-        limb = next(x for x in world.robot.limbs.values() if x.is_arm == arm)
-        a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
-        return float(np.linalg.norm(b - a) + np.linalg.norm(c - b))
-
-    shoulder, hip = (
-        next(
-            kin.landmark(x.root)[1]
-            for x in world.robot.limbs.values()
-            if x.is_arm == arm
-        )
-        for arm in (True, False)
-    )
-    reach = length(True) + float(np.linalg.norm(shoulder - hip)) + length(False)
-    start = np.array([*world.scene.start[:2], 0.0])
-    for box in world.scene.boxes[:1]:
-        top = box.top
-        local = top.rotation.T @ (start - top.position)
-        half = top.polygon.max(axis=0)
-        nearest = np.array([*np.clip(local[:2], -half, half), 0.0])
-        distance = float(np.linalg.norm(nearest - local))
-        if distance > reach:
-            raise InputError(
-                f"the nearest point of its top within {reach:.2f} m of the start,"
-                " the robot's reach",
-                field=f"scene.boxes.{box.name}",
-                value=f"{distance:.2f} m away",
-            )

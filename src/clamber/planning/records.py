@@ -27,8 +27,6 @@ def silent(stage: str, share: float, note: str) -> None:
     """Report progress to nobody."""
 
 
-
-
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PlanOptions:
     """How a plan is made.

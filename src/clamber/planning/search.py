@@ -1,9 +1,9 @@
 """One search: contact changes are tried, what promises most first, until one arrives.
 
-What may come next is an `Entry`: a route so far, a price, and what to do for more. An
-entry that is taken from the queue is tried, and what it leads to is put into it. What is
-tried, and with what result, is noted for all searches of a plan together, and one
-budget bounds them.
+What may come next is an `Entry`: how far it has come, its price, and what to try for
+more. The cheapest is taken from the queue and tried, and what it leads to is put there.
+What is tried, and with what result, is noted for all searches of a plan together, and
+one budget bounds them.
 """
 
 from __future__ import annotations

@@ -20,11 +20,12 @@ from clamber.model.scene import GROUND, Scene
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World, build_world
 from clamber.planning.records import Plan, PlanOptions, State
-from clamber.step import direct
 from clamber.step.change import standing
-from clamber.step.ik import IK, support_rotation
+from clamber.step.ik import IK
+from clamber.step.methods import direct
 from clamber.step.path import Phase, bridge
 from clamber.step.posture import Keyframe, KeyframeTask
+from clamber.step.tasks import support_rotation
 from clamber.step.transition import balance_problem
 
 TOUCHING = 0.005  # [m] a surface that is nearer to a support is in contact
@@ -65,7 +66,7 @@ def settle(
     problem = balance_problem(
         world,
         held=now.loaded,
-        closed=tuple(c for c in now.stance if c not in now.loaded),
+        unloaded=tuple(c for c in now.stance if c not in now.loaded),
         q_reference=now.q,
         posture_weight=1.0,
         margin=0.005,
@@ -73,7 +74,7 @@ def settle(
     problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
     here = ik.solve_hard(problem, now.q)
     task = KeyframeTask(held=now.stance, new=(), q_reference=here.q)
-    key = direct.optimise(ik, task, here.q, options.keyframe)
+    key = direct(ik, task, here.q, options.keyframe)
     if key.status is not Status.SOLVED:
         return key, ()
     begin = here.q.copy()

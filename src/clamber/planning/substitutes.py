@@ -1,4 +1,4 @@
-"""Other contacts than the demonstrated ones [thesis 5.3, algorithm 4].
+r"""Other contacts than the demonstrated ones [thesis 5.3, algorithm 4].
 
 What a demonstration touches beyond its first stance, stance by stance, is
 

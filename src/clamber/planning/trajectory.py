@@ -26,6 +26,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_conjugate, quat_multiply
 from clamber.model.world import World
 from clamber.planning.timing import GRID, demand_at, least_torques, retime
+from clamber.step.change import Change
 from clamber.step.path import Phase
 from clamber.step.stability import contact_points, torque_limits
 from clamber.step.statics import (
@@ -483,6 +484,30 @@ def build_trajectory(
         keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
         segments=_segments(phases, stops.tolist(), keyframe_after),
     )
+
+
+def timed(
+    world: World,
+    changes: Sequence[Change],
+    speed: float | Literal["max"],
+    lead: Sequence[Phase] = (),
+) -> Trajectory | None:
+    """The trajectory of `lead`, which leads to the first keyframe, and the changes.
+
+    Args:
+        world: Robot and scene.
+        changes: One after the other.
+        speed: Largest joint speed [rad/s], or `max`.
+        lead: Phases before the first change.
+
+    Returns:
+        None where nothing moves.
+    """
+    phases = [*lead, *(p for change in changes for p in change.phases)]
+    if not phases:
+        return None
+    ends = np.cumsum([len(lead), *(len(change.phases) for change in changes)])
+    return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
 
 
 def _segments(

@@ -12,16 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clamber.contact.contact import Contact, ContactSequence, Stance
+from clamber.contact.contact import Contact
 from clamber.contact.policy import GeneralPolicy, pelvis_rotation
 from clamber.contact.steps import Step
 from clamber.model.records import short_repr
-from clamber.model.robot import Robot
-from clamber.model.scene import GROUND, Scene
+from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
-from clamber.model.world import World, build_world
+from clamber.model.world import World
+from clamber.planning.demonstrated import search_steps
 from clamber.planning.gait import Gait
-from clamber.planning.planner import check_start, search_steps, timed
 from clamber.planning.proposals import (
     Climb,
     Goal,
@@ -35,7 +34,6 @@ from clamber.planning.proposals import (
 from clamber.planning.records import (
     Fallback,
     Iteration,
-    Plan,
     PlanOptions,
     Progress,
     Route,
@@ -68,71 +66,6 @@ class Followed:
     fallback: Fallback | None
 
     __repr__ = short_repr
-
-
-def plan_traverse(
-    policy: GeneralPolicy,
-    robot: Robot,
-    scene: Scene,
-    *,
-    options: PlanOptions | None = None,
-    progress: Progress | None = None,
-) -> Plan:
-    """Plan the way to the scene's goal with a general policy.
-
-    Raises:
-        InputError: The scene is out of the robot's reach, its goal cannot be, or the
-            policy does not say how to climb.
-    """
-    options = options or PlanOptions()
-    report = progress or _silent
-    ik = IK(build_world(robot, scene))
-    followers = followers_of(ik, policy, options)
-    start = standing(ik, options.keyframe)
-    check_start(ik, start)
-    followers[0].gait.check_route()
-    found = follow(followers, start, options.max_changes, report)
-    route = found.route
-    report("trajectory", 1.0, "")
-    stances = tuple(Stance(contacts=k.stance) for k in route.keyframes)
-    return Plan(
-        world=ik.world,
-        options=options,
-        sequence=ContactSequence(
-            source="; ".join(policy.sources) or "a policy",
-            subject=None,
-            scene=scene,
-            stances=stances,
-            t=np.arange(len(stances) + 1.0),
-        ),
-        start=route.start,
-        changes=route.changes,
-        failures=route.failures,
-        trajectory=timed(ik.world, route.changes, options.speed),
-        complete=route.arrived and bool(route.changes),
-        fallback=found.fallback,
-        policy=policy,
-        iterations=found.iterations,
-    )
-
-
-def follow_policy(
-    ik: IK, policy: GeneralPolicy, key: Keyframe, options: PlanOptions, changes: int
-) -> Followed:
-    """Go on with a policy from a keyframe.
-
-    Args:
-        ik: Workspace.
-        policy: The policy; where it has no stable step, its secondary ones are tried.
-        key: Where to go on from.
-        options: Of the plan.
-        changes: Contact changes at most, then to the end of what was begun.
-    """
-    return follow(followers_of(ik, policy, options), key, changes, _silent)
-
-
-def _silent(stage: str, share: float, note: str) -> None:
-    """Report to nobody."""
 
 
 def cost_to_go(stance: Sequence[Contact], goal: np.ndarray) -> float:
@@ -288,8 +221,8 @@ def follow(
     fallback = None
     if others:
         reason = "" if failure is None else str(failure)
-        tried = "; ".join(others)
-        fallback = Fallback(reason=reason, source="secondary", tried=tried)
+        detail = "; ".join(others)
+        fallback = Fallback(reason=reason, source="secondary", detail=detail)
     return Followed(route=route, iterations=tuple(iterations), fallback=fallback)
 
 

@@ -35,8 +35,8 @@ from clamber.model.robot import Robot
 from clamber.model.scene import Scene
 from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
+from clamber.planning.planner import Replanned
 from clamber.planning.records import Fallback, Plan
-from clamber.planning.substitutes import Replanned
 from clamber.planning.trajectory import Trajectory
 from clamber.run.codec import (
     VERSION,
@@ -293,7 +293,9 @@ def _plan_of(at: At) -> dict[str, Any]:
 def fallback_note(written: Mapping[str, Any]) -> str:
     """What the fields of a `plan.json` say of its fallback; empty without one."""
     fields = written.get("fallback")
-    return "" if fields is None else str(Fallback(**fields))
+    if fields is None:
+        return ""
+    return str(CODEC.decode(Fallback, At(fields, Path(PLAN), "fallback")))
 
 
 def trajectory_of(plan: Plan, source: Path) -> Trajectory:
@@ -422,10 +424,11 @@ def save_proposal(proposal: Proposal, folder: str | Path) -> None:
 
 
 def save_replanned(found: Replanned, folder: str | Path) -> None:
-    """Write `replan.json`: what was tried, the best first, and what the search did."""
+    """Write `replan.json`: the plans, the best first, and what was tried for them."""
     plans = [
         {
             "surfaces": r.surfaces,
+            "source": r.source,
             "cost": r.cost,
             "stable": r.stable,
             "moves": [str(c.step) for c in r.plan.changes],
@@ -433,10 +436,8 @@ def save_replanned(found: Replanned, folder: str | Path) -> None:
         }
         for r in found.ranked
     ]
-    e = found.explored
-    search = e and {"states": e.states, "tries": e.tries, "stop": e.stop.value}
-    content = {"differences": found.differences, "plans": plans, "search": search}
-    write_json(Path(folder) / REPLANNED, CODEC.encode(content))
+    tried = {"differences": found.differences, "plans": plans, "tried": found.tried}
+    write_json(Path(folder) / REPLANNED, CODEC.encode(tried))
 
 
 # Rollouts and verdicts.

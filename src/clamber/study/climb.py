@@ -26,10 +26,8 @@ from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.terrain import load_scene
 from clamber.model.world import PHYSICS_STEP
-from clamber.planning.free import Bounds
 from clamber.planning.planner import plan
-from clamber.planning.records import Method, Plan, PlanOptions
-from clamber.planning.substitutes import plan_or_replan
+from clamber.planning.records import Budget, Method, Plan, PlanOptions
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 
@@ -62,7 +60,7 @@ class Climb:
     speed: float | Literal["max"] = field(default_factory=lambda: PlanOptions().speed)
     controller: ControlMode = DEFAULT_CONTROLLER
     contacts: Contacts = "any"
-    search: Bounds = field(default_factory=Bounds)
+    search: Budget = field(default_factory=Budget)
     disturb: Disturbance = field(default_factory=Disturbance)
 
     def __post_init__(self) -> None:
@@ -95,7 +93,7 @@ class ClimbResult:
 
 
 _CLIMB: pydantic.TypeAdapter[Climb] = pydantic.TypeAdapter(Climb)
-GROUPS = {"search": Bounds, "disturb": Disturbance}  # flags such as `disturb.mass`
+GROUPS = {"search": Budget, "disturb": Disturbance}  # flags such as `disturb.mass`
 FLAGS = tuple(f.name for f in fields(Climb) if f.name not in GROUPS) + tuple(
     f"{group}.{f.name}" for group, kind in GROUPS.items() for f in fields(kind)
 )
@@ -193,6 +191,4 @@ def _planned(climb: Climb) -> Plan:
     robot, scene = load_robot(climb.robot), scene_of(climb.height, climb.scene)
     world = (_detected(climb.demo), robot, scene)
     options = PlanOptions(method=climb.method, speed=climb.speed)
-    if climb.contacts == "demonstrated":
-        return plan(*world, options=options)
-    return plan_or_replan(*world, options=options, bounds=climb.search)
+    return plan(*world, options=options, contacts=climb.contacts, budget=climb.search)

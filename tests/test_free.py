@@ -15,15 +15,15 @@ from clamber.contact.steps import split_moves
 from clamber.errors import InputError, Status
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
-from clamber.planning import free as exploration
+from clamber.planning import search as search_module
 from clamber.planning.free import (
-    Bounds,
-    Stop,
     action_counts,
-    explore,
     policy_counts,
+    search_contacts,
+    sequence_of,
 )
-from clamber.planning.records import PlanOptions, Route
+from clamber.planning.records import Budget, PlanOptions, Route
+from clamber.planning.search import Search
 from clamber.step.change import Failure, standing
 from clamber.step.ik import IK
 from clamber.step.stability import contact_drift
@@ -48,15 +48,20 @@ def tried(monkeypatch):
         moves.append(step)
         return Failure(status=Status.COLLIDING, step=step)
 
-    monkeypatch.setattr(exploration, "change_contact", fail)
+    monkeypatch.setattr(search_module, "change_contact", fail)
     return moves
 
 
-def search(ik, goal, counts=None, start=None, **bounds):
+def search(ik, goal, counts=None, start=None, **budget):
     counts = action_counts(goal, ik.world) if counts is None else counts
-    options = PlanOptions()
-    start = Route(start=standing(ik, options.keyframe) if start is None else start)
-    return explore(ik, goal, options, counts, Bounds(**bounds), start)
+    shared = Search(ik, PlanOptions(), Budget(**budget))
+    if not isinstance(start, Route):
+        start = Route(start=start or standing(ik, PlanOptions().keyframe))
+    return search_contacts(shared, start, goal, counts)
+
+
+def why(route) -> Status:
+    return route.failures[0].status
 
 
 def test_actions_are_counted_in_the_regions_in_which_they_are_taken(goal, ik):
@@ -89,28 +94,28 @@ def found(ik, goal):
 
 
 def test_a_way_up_is_found_on_a_box_that_can_be_climbed(found):
-    assert found.stop is Stop.FOUND
-    assert 0 < found.states <= found.tries <= Bounds().tries
-    assert region_of(found.route.keyframes[-1].stance) == "O"
-    assert len(found.route.keyframes[-1].stance) == 4  # a surface of each limb
+    assert found.arrived
+    assert region_of(found.keyframes[-1].stance) == "O"
+    assert len(found.keyframes[-1].stance) == 4  # a surface of each limb
 
 
 def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, ik):
-    steps, skipped = split_moves(found.sequence, ik.world)
+    steps, skipped = split_moves(sequence_of(ik.world, found), ik.world)
     assert skipped == []
-    for step, change in zip(steps, found.route.changes, strict=True):
+    for step, change in zip(steps, found.changes, strict=True):
         move = change.step
         assert step.breaks == move.breaks
         assert step.makes.surface == move.makes.surface
         assert np.allclose(step.makes.position, move.makes.position)
-    again = retarget(found.sequence, ik.world)
-    for a, b in zip(again.stances, found.sequence.stances, strict=True):
+    own = sequence_of(ik.world, found)
+    again = retarget(own, ik.world)
+    for a, b in zip(again.stances, own.stances, strict=True):
         for c, d in zip(a.contacts, b.contacts, strict=True):
             assert np.linalg.norm(c.position - d.position) < 0.01
 
 
 def test_every_keyframe_that_is_found_closes_its_contacts_and_holds(found, ik):
-    for key in found.route.keyframes:
+    for key in found.keyframes:
         ik.kin.update(key.q)
         assert key.equilibrium.feasible
         assert max(contact_drift(ik.kin, c) for c in key.stance) < 1e-3
@@ -118,8 +123,7 @@ def test_every_keyframe_that_is_found_closes_its_contacts_and_holds(found, ik):
 
 def test_the_same_search_finds_the_same(found, ik, goal):
     again = search(ik, goal)
-    assert (again.states, again.tries) == (found.states, found.tries)
-    for a, b in zip(again.route.keyframes, found.route.keyframes, strict=True):
+    for a, b in zip(again.keyframes, found.keyframes, strict=True):
         assert np.array_equal(a.q, b.q)
 
 
@@ -127,10 +131,10 @@ def test_where_the_robot_is_there_already_nothing_is_planned(
     ik, goal, demo_plan, tried
 ):
     there = search(ik, goal, start=demo_plan.keyframes[-1])
-    assert (there.stop, there.tries, there.route.changes) == (Stop.FOUND, 0, ())
-    assert len(there.sequence.stances) == 1
+    assert (there.arrived, there.changes, tried) == (True, (), [])
+    assert len(sequence_of(ik.world, there).stances) == 1
     almost = search(ik, goal, start=demo_plan.keyframes[-2], tries=3)
-    assert almost.stop is Stop.TRIES
+    assert why(almost) is Status.BUDGET
 
 
 def test_a_goal_in_the_scene_is_to_be_reached_too(demo_plan, coman, goal, tried):
@@ -139,7 +143,7 @@ def test_a_goal_in_the_scene_is_to_be_reached_too(demo_plan, coman, goal, tried)
         xy = key.q[:2] + np.array([off, 0.0])
         ik = IK(build_world(coman, replace(demo_plan.world.scene, goal=xy)))
         ended = search(ik, goal, start=key, tries=2)
-        assert (ended.stop is Stop.FOUND) is there
+        assert ended.arrived is there
 
 
 def test_a_demonstration_that_ends_where_it_began_asks_for_a_place(ik, goal, tried):
@@ -150,9 +154,9 @@ def test_a_demonstration_that_ends_where_it_began_asks_for_a_place(ik, goal, tri
     ]
     there = replace(goal.stances[0], contacts=tuple(far))
     back = replace(goal, stances=(*goal.stances[:-1], there))
-    assert search(ik, back, tries=1).stop is Stop.TRIES  # not FOUND at once
+    assert why(search(ik, back, tries=1)) is Status.BUDGET  # not FOUND at once
     here = replace(goal, stances=(*goal.stances[:-1], goal.stances[0]))
-    assert search(ik, here, tries=1).stop is Stop.FOUND
+    assert search(ik, here, tries=1).arrived
 
 
 def standing_on_box(goal, world):
@@ -179,13 +183,13 @@ def test_to_stand_is_to_be_on_the_feet_alone_and_up(ik, goal, tried, height):
     q = key.q.copy()
     q[2] = height * q[2] + feet[0].position[2]
     ended = search(ik, upright, start=replace(key, contacts=states, q=q), tries=1)
-    assert (ended.stop is Stop.FOUND) is (height == 1.0)
+    assert ended.arrived is (height == 1.0)
 
 
 def test_kneeling_is_no_standing_and_arms_may_let_go(ik, goal, demo_plan, tried):
     upright, _ = standing_on_box(goal, ik.world)
     ended = search(ik, upright, start=demo_plan.keyframes[-1], tries=1000)
-    assert ended.stop is not Stop.FOUND
+    assert not ended.arrived
     lets_go = {m.breaks for m in tried if m.makes is None}
     assert lets_go == {("LElbow",), ("RElbow",)}
     tried.clear()
@@ -198,11 +202,9 @@ def test_kneeling_is_no_standing_and_arms_may_let_go(ik, goal, demo_plan, tried)
 
 def test_a_search_ends_when_everything_within_its_bounds_is_tried(ik, goal, tried):
     ended = search(ik, goal, tries=1000)
-    assert ended.stop is Stop.EXHAUSTED
-    assert ended.states == 1
-    assert ended.tries == len(tried)
-    assert ended.sequence is None
-    assert ended.route.changes == ()
+    assert why(ended) is Status.EXHAUSTED
+    assert not ended.arrived
+    assert ended.changes == ()
     moves = [
         (m.breaks, m.makes.surface, m.makes.support, *m.makes.position.round(3))
         for m in tried
@@ -212,32 +214,30 @@ def test_a_search_ends_when_everything_within_its_bounds_is_tried(ik, goal, trie
 
 def test_no_more_steps_are_planned_than_allowed(ik, goal, tried):
     ended = search(ik, goal, tries=3)
-    assert (ended.stop, ended.tries, len(tried)) == (Stop.TRIES, 3, 3)
+    assert (why(ended), len(tried)) == (Status.BUDGET, 3)
 
 
 def test_without_moves_there_is_nothing(ik, goal, tried):
     ended = search(ik, goal, depth=0)
-    assert (ended.stop, ended.states, ended.tries) == (Stop.EXHAUSTED, 0, 0)
+    assert (why(ended), tried) == (Status.EXHAUSTED, [])
 
 
 def test_no_sequence_is_longer_than_allowed(ik, goal, demo_plan, monkeypatch):
     """Every step is possible, and none gets there."""
     change = replace(demo_plan.changes[0], keyframe=demo_plan.start)
-    monkeypatch.setattr(exploration, "change_contact", lambda *a: change)
+    monkeypatch.setattr(search_module, "change_contact", lambda *a: change)
     ended = search(ik, goal, tries=10_000, depth=2)
-    assert ended.stop is Stop.EXHAUSTED
+    assert why(ended) is Status.EXHAUSTED
 
 
 def test_what_is_gone_on_from_is_part_of_what_is_found(ik, goal, demo_plan):
     """Five steps are made: one more gets there, and that is all that depth counts."""
     made = Route(start=demo_plan.start, changes=demo_plan.changes[:5])
-    counts = action_counts(goal, ik.world)
-    bounds = Bounds(tries=20, depth=1)
-    ended = explore(ik, goal, PlanOptions(), counts, bounds, made)
-    assert ended.stop is Stop.FOUND
-    assert len(ended.route.changes) == 6
-    assert ended.route.changes[:5] == made.changes
-    again = split_moves(ended.sequence, ik.world)[0]
+    ended = search(ik, goal, start=made, tries=20, depth=1)
+    assert ended.arrived
+    assert len(ended.changes) == 6
+    assert ended.changes[:5] == made.changes
+    again = split_moves(sequence_of(ik.world, ended), ik.world)[0]
     surfaces = [s.makes.surface for s in again]
     assert surfaces[:5] == [c.step.makes.surface for c in made.changes]
     assert surfaces[5] == "RKnee"
@@ -255,17 +255,17 @@ def test_the_last_step_to_the_feet_rises_and_no_other_does(ik, goal, monkeypatch
         steps.append(step)
         return Failure(status=Status.COLLIDING, step=step)
 
-    monkeypatch.setattr(exploration, "change_contact", refuse)
+    monkeypatch.setattr(search_module, "change_contact", refuse)
     search(ik, upright, start=replace(key, contacts=tuple(states)), tries=1000)
     assert any(s.makes is None for s in steps)
     for s in steps:
         assert s.stands_up == (s.makes is None)
 
 
-@pytest.mark.parametrize("name", ["tries", "depth"])
+@pytest.mark.parametrize("name", ["tries", "depth", "seconds", "ahead"])
 def test_a_bound_is_not_negative(name):
     with pytest.raises(InputError, match=f"{name} is -1; expected 0 or more"):
-        Bounds(**{name: -1})
+        Budget(**{name: -1})
 
 
 # What comes first.
@@ -304,7 +304,7 @@ def test_places_beyond_reach_are_not_tried(coman, demo_sequence, tried):
     box = replace(scene.boxes[0], position=scene.boxes[0].position + away)
     ik = IK(build_world(coman, replace(scene, boxes=(box,))))
     ended = search(ik, retarget(demo_sequence, ik.world), tries=1000)
-    assert ended.stop is Stop.EXHAUSTED
+    assert why(ended) is Status.EXHAUSTED
     assert all(m.makes.support == "ground" for m in tried)
 
 
@@ -320,5 +320,5 @@ def test_places_lie_on_their_supports(ik, goal, tried):
 def test_a_box_too_high_for_all_alternatives_has_a_way_up(coman, demo_sequence):
     ik = IK(build_world(coman, Scene.from_height(0.62)))
     found = search(ik, retarget(demo_sequence, ik.world))
-    assert found.stop is Stop.FOUND
-    assert region_of(found.route.keyframes[-1].stance) == "O"
+    assert found.arrived
+    assert region_of(found.keyframes[-1].stance) == "O"
