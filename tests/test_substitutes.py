@@ -20,7 +20,7 @@ from clamber.model.scene import Scene
 from clamber.model.world import build_world
 from clamber.planning import planner, search
 from clamber.planning.planner import plan, replan
-from clamber.planning.records import Budget
+from clamber.planning.records import Attempt, Budget
 from clamber.planning.substitutes import (
     contact_alternatives,
     contact_differences,
@@ -219,7 +219,10 @@ def failing(monkeypatch):
         def change(self, proposer, before, step, options=None):
             makes = step.makes
             if of(proposer) and makes is not None and makes.surface in surfaces:
-                return Failure(status=Status.UNREACHABLE, step=step, detail="sore")
+                why = Failure(status=Status.UNREACHABLE, step=step, detail="sore")
+                attempt = Attempt(proposer=proposer, step=step, failure=why)
+                self.attempts.append(attempt)
+                return why
             return plain(self, proposer, before, step, options)
 
         monkeypatch.setattr(search.Search, "change", change)

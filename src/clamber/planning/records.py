@@ -163,7 +163,10 @@ class State:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Copy the posture and make it read-only."""
+        """Copy the posture, read-only; what is loaded is of the stance itself."""
+        names = {c.surface for c in self.loaded}
+        loaded = tuple(c for c in self.stance if c.surface in names)
+        object.__setattr__(self, "loaded", loaded)
         object.__setattr__(self, "q", frozen_array(self.q))
 
 
