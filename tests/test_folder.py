@@ -245,9 +245,9 @@ def test_a_loaded_plan_is_run_planned_again_and_told_as_the_one_that_was_made(
     assert not list(differences(again, rollout))
     assert plan_record(loaded) == plan_record(plan)
     assert plan_record(loaded)["keyframes"][1]["move"] == "air -> LHand on box"
-    q, scene = rollout.qpos[0], plan.world.scene
+    q, scene, robot = rollout.qpos[0], plan.world.scene, plan.world.robot
     rest, other = (
-        clamber.replan_rest(x, clamber.state_of(x, scene, q, None), scene)
+        clamber.plan(x.sequence, robot, scene, start=clamber.state_of(x, scene, q))
         for x in (loaded, plan)
     )
     assert len(rest.changes) == 1
