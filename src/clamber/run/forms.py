@@ -93,12 +93,10 @@ def _read_scene(at: At) -> Scene:
         size, bottom = (CODEC.decode(Vector, box.key(n)) for n in ("size", "position"))
         boxes.append(
             Box(
-                name=CODEC.decode(str, box.key("name")),
+                **CODEC.fields(Box, box, without=("size", "position", "rotation")),
                 size=np.array(size),
                 position=np.add(bottom, [0.0, 0.0, size[2] / 2]),
                 rotation=matrix_from_rpy(CODEC.decode(Vector, box.key("rpy"))),
-                friction=CODEC.decode(float, box.key("friction")),
-                roughness=CODEC.decode(float, box.key("roughness")),
             )
         )
     friction = CODEC.decode(float, at.key("ground").key("friction"))
