@@ -6,7 +6,7 @@ import enum
 import json
 import typing
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -170,8 +170,8 @@ def rarer(plan: Plan) -> Iterator[Any]:
     yield Fallback(reason="no way", source="search", surfaces=("LHand",), tried="all")
     of = {float: 1 / 3, str: "LHand", bool: True, int: 3}
     for kind in EVENTS.values():
-        hints = typing.get_type_hints(kind).items()
-        yield kind(**{n: of[t] for n, t in hints})  # type: ignore[arg-type]
+        hints = typing.get_type_hints(kind)
+        yield kind(**{f.name: of[hints[f.name]] for f in fields(kind)})
     yield Skipped(stance=1, reason="out of reach")
     yield Iteration(option="ac1", cost=1 / 3)
 
