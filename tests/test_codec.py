@@ -26,7 +26,7 @@ from clamber.execution.verdict import Verdict, judge
 from clamber.model.robot import Limb, Robot
 from clamber.model.scene import Support
 from clamber.model.world import Surface, World
-from clamber.planning.records import Fallback, Iteration, Plan, State
+from clamber.planning.records import Fallback, Iteration, Plan, State, Tried
 from clamber.planning.trajectory import Samples, Trajectory
 from clamber.run.codec import (
     Arrays,
@@ -167,7 +167,8 @@ def rarer(plan: Plan) -> Iterator[Any]:
     key = plan.keyframes[-1]
     yield State(done=1, stance=key.stance, loaded=key.stance[:1], q=key.q)
     yield Failure(status=Status.UNREACHABLE, step=plan.changes[0].step)
-    yield Fallback(reason="no way", source="search", surfaces=("LHand",), tried="all")
+    tried = (Tried(proposer="search", steps=2, failed=1, last="out of reach"),)
+    yield Fallback(reason="no way", source="search", surfaces=("LHand",), tried=tried)
     of = {float: 1 / 3, str: "LHand", bool: True, int: 3}
     for kind in EVENTS.values():
         hints = typing.get_type_hints(kind)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from clamber.contact.contact import Contact, ContactInterval, ContactSequence, Stance
+from clamber.contact.contact import ContactInterval, ContactSequence, Stance
 from clamber.contact.policy import PelvisDistribution
 from clamber.errors import validated
 from clamber.execution.events import EVENTS, Event
@@ -138,20 +138,6 @@ def _read_robot(at: At) -> Robot:
     return robot_of(validated(RobotFile, at.value, at.file), ROBOTS)
 
 
-def _write_state(s: State) -> dict[str, Any]:
-    loaded = [c.surface for c in s.loaded]
-    return {"done": s.done, "qpos": s.q, "stance": s.stance, "loaded": loaded}
-
-
-def _read_state(at: At) -> State:
-    """A contact that is loaded is the one of the stance, not another one like it."""
-    stance = CODEC.decode(tuple[Contact, ...], at.key("stance"))
-    names = CODEC.decode(tuple[str, ...], at.key("loaded"))
-    loaded = tuple(c for c in stance if c.surface in names)
-    rest = CODEC.fields(State, at, without=("stance", "loaded"))
-    return State(stance=stance, loaded=loaded, **rest)
-
-
 FORMS: dict[type, Form] = {
     Scene: Form(write=_write_scene, read=_read_scene),
     Robot: Form(write=_write_robot, read=_read_robot),
@@ -161,7 +147,7 @@ FORMS: dict[type, Form] = {
     ContactInterval: Form(beside=("contact",)),
     ContactState: Form(beside=("contact",)),
     PelvisDistribution: Form(null={"sigma": math.inf}),
-    State: Form(names={"q": "qpos"}, write=_write_state, read=_read_state),
+    State: Form(names={"q": "qpos"}),
     Failure: Form(
         more=lambda f: {"stance": f.step and f.step.stance, "reason": str(f)}
     ),
