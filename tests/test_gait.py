@@ -280,7 +280,10 @@ def test_a_descent_is_the_ascent_reversed_and_stands_up_at_its_end(gait):
 def test_where_there_is_no_way_down_contacts_move_to_where_there_is(gait):
     """Only those that are elsewhere."""
     back = on_fours(gait, 0.83 - gait.proportions.behind, math.pi)
-    refused = lambda c: c.support == GROUND  # noqa: E731
+
+    def refused(c: Contact) -> bool:
+        return c.support == GROUND
+
     up, *_ = proposed(gait, back, refused)
     there = {s.makes.surface: s.makes for s, _ in up.steps}
     off = {"LElbow": 0.03, "RElbow": 0.01, "LKnee": 0.04, "RKnee": 0.0}
@@ -298,7 +301,7 @@ def test_where_there_is_no_way_down_contacts_move_to_where_there_is(gait):
 
 def test_where_not_all_of_a_pair_fit_on_a_tread_both_go_to_their_next_places():
     gait = gait_in(stairs(3, 0.1, 0.4))
-    feet = [contact(s, 0.51, c.position[1], "s1") for s, c in zip(FEET, on_feet())]  # noqa: B905
+    feet = [contact(c.surface, 0.51, c.position[1], "s1") for c in on_feet()]
     stance = (contact("LHand", 0.99, 0.17, "s2"), contact("RHand", 0.99, -0.17, "s2"))
     far, near = proposed(gait, (*feet, *stance), lambda c: c.surface == "LFoot")[:2]
     assert wanted(far) == wanted(near) == FEET
@@ -352,8 +355,8 @@ def test_a_cycle_that_fails_is_proposed_otherwise_in_order(wide):
 
 def test_the_others_come_back_around_a_limb_that_is_left_behind(wide):
     """Where they stand around it on all fours, then nearer to it."""
-    refused = lambda c: c.surface == "RKnee"  # noqa: E731
-    tries = cycles(proposed(wide, on_fours(wide, 1.0), refused))
+    stance = on_fours(wide, 1.0)
+    tries = cycles(proposed(wide, stance, lambda c: c.surface == "RKnee"))
     back = [p for p in tries if p.accept == "never"]
     follows = [p for p in tries[6:] if wanted(p) == ("RKnee",)]
     assert set(map(wanted, back)) == {("LElbow", "RElbow", "LKnee")}
@@ -449,8 +452,9 @@ def test_over_a_riser_shorter_cycles_and_hands_are_proposed_first(risers):
 
 def test_what_has_climbed_a_riser_does_not_go_back_down_for_another_ones_sake(risers):
     """Where knees are at 0.45 m, elbows belong before the riser."""
-    stance = tuple(contact(s, 0.80, y, "b") for s, y in zip(ELBOWS, (0.12, -0.12)))  # noqa: B905
-    stance += tuple(contact(s, 0.45, y, "a") for s, y in zip(KNEES, (0.1, -0.1)))  # noqa: B905
+    elbows = (contact("LElbow", 0.80, 0.12, "b"), contact("RElbow", 0.80, -0.12, "b"))
+    knees = (contact("LKnee", 0.45, 0.1, "a"), contact("RKnee", 0.45, -0.1, "a"))
+    stance = (*elbows, *knees)
     tries = cycles(proposed(risers, stance, lambda c: c.surface == "RKnee"))
     back = [p for p in tries if p.accept == "never"]
     assert back
@@ -536,8 +540,8 @@ def test_a_gap_is_ahead_until_the_last_contact_is_over_it(gap):
 
 def test_where_knees_do_not_reach_across_they_do_from_a_stand_on_both_feet(gap):
     stance = near_gap(gap, 0.98 + 2.0 * gap.proportions.stretch, 0.80)
-    across = lambda c: c.surface in KNEES and c.support == "b2"  # noqa: E731
-    tries = [p for p in cycles(proposed(gap, stance, across)) if p.rounds == FREELY]
+    asked = proposed(gap, stance, lambda c: c.surface in KNEES and c.support == "b2")
+    tries = [p for p in cycles(asked) if p.rounds == FREELY]
     knees, stand, step = (p for p in tries if not set(wanted(p)) & set(ELBOWS))
     assert set(wanted(knees)) == set(wanted(step)) == set(KNEES)
     assert set(wanted(stand)) == set(FEET)

@@ -78,8 +78,10 @@ def narrow() -> Climber:
 
 def heights(scene: Scene, *z: float) -> Scene:
     """The same boxes, that high."""
-    sized = (replace(b, size=[*b.size[:2], h]) for b, h in zip(scene.boxes, z))  # noqa: B905
-    boxes = (replace(b, position=[*b.position[:2], b.size[2] / 2]) for b in sized)
+    boxes = (
+        replace(b, size=[*b.size[:2], h], position=[*b.position[:2], h / 2])
+        for b, h in zip(scene.boxes, z, strict=True)
+    )
     return replace(scene, boxes=tuple(boxes))
 
 
