@@ -1113,27 +1113,20 @@ def test_a_contact_out_of_reach_is_unreachable(plain):
     assert truth["contact"] > 0.1
 
 
-def test_a_margin_that_no_stance_has_is_unbalanced(plain):
+def test_a_margin_that_no_stance_has_is_unbalanced_feet_too_close_collide(plain):
     w = plain.world
-    feet = stance_problem(plain).tasks[:2]
+    left, right, _ = stance_problem(plain).tasks
     clearance = contact_clearance(w, 0.01, {"LFoot": "ground", "RFoot": "ground"})
-    problem = stance_problem(
-        plain, tasks=feet, clearance=clearance, balance_margin=0.15
+    wide = stance_problem(
+        plain, tasks=(left, right), clearance=clearance, balance_margin=0.15
     )
-    solution = plain.solve(problem, w.home)
+    solution = plain.solve(wide, w.home)
     assert solution.status is Status.UNBALANCED
     # As near to it as the feet allow: their hull is 0.20 m long.
     assert solution.residuals.com_margin == pytest.approx(0.1, abs=0.005)
-
-
-def test_feet_that_must_stand_too_close_collide(plain):
-    w = plain.world
-    left, right, _ = stance_problem(plain).tasks
     near = beside(left, right, 0.08)
-    where = {"LFoot": "ground", "RFoot": "ground"}
-    clearance = contact_clearance(w, 0.01, where)
-    problem = stance_problem(plain, tasks=(near, right), clearance=clearance)
-    solution = plain.solve(problem, w.home)
+    tight = stance_problem(plain, tasks=(near, right), clearance=clearance)
+    solution = plain.solve(tight, w.home)
     # Feet that overlap satisfy neither: whichever gives way, it is not called solved.
     assert solution.status in (Status.COLLIDING, Status.UNREACHABLE)
     a, b = (w.model.geom(int(g)).name for g in w.pairs[solution.residuals.worst_pair])

@@ -18,7 +18,7 @@ from clamber.model.scene import Box, Scene
 from clamber.show import plots
 from clamber.show.plots import pelvis_plot, policy_plot, save_pictures
 from conftest import contact
-from test_contraction import crossing, posed
+from test_learn import crossing, posed
 
 
 def pixels(path: Path) -> np.ndarray:
