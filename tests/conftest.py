@@ -255,12 +255,12 @@ def one_hand_rollout(one_hand_plan):
 def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
     """The run folder of that motion; of the module alone, which may write in it."""
     from clamber import judge
-    from clamber.run import folder as io
+    from clamber.run.folder import save_plan, save_rollout, save_verdict
 
     folder = tmp_path_factory.mktemp("whole")
-    io.save_plan(one_hand_plan, folder)
-    io.save_rollout(one_hand_plan, one_hand_rollout, folder)
-    io.save_verdict(judge(one_hand_plan, one_hand_rollout), folder)
+    save_plan(one_hand_plan, folder)
+    save_rollout(one_hand_plan, one_hand_rollout, folder)
+    save_verdict(judge(one_hand_plan, one_hand_rollout), folder)
     return folder
 
 
