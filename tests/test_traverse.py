@@ -124,7 +124,7 @@ def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step():
     assert (first.asked, other.asked) == (3, 2)
     assert [i.option for i in found.iterations] == ["ac3", "ac3, secondary 1"]
     assert found.fallback.source == "secondary"
-    assert found.fallback.tried == "secondary 1 from change 2 on (stuck)"
+    assert found.fallback.detail == "secondary 1 from change 2 on (stuck)"
     assert found.route.failures == (stuck,)
 
 
