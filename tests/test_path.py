@@ -317,3 +317,19 @@ def test_where_little_moves_a_bridge_has_no_postures_between(demo_paths, ik):
     assert len(path_module.bridge(ik, t.before, near, t.held, t.held)) == 2
     far = max(p.phases[0].q.shape[0] for p in demo_paths)
     assert far > 2
+
+
+def test_the_repr_of_what_a_change_is_made_of_is_short(demo_plan, demo_paths):
+    change, key = demo_plan.changes[-1], demo_plan.keyframes[-1]
+    for record in (
+        change,
+        change.step,
+        change.step.makes,
+        change.phases[0],
+        key,
+        key.contacts[0],
+        key.equilibrium,
+        demo_paths[-1],
+        demo_paths[-1].transition,
+    ):
+        assert len(repr(record)) < 300, record
