@@ -11,7 +11,7 @@ import pytest
 from clamber.contact.contact import region_of
 from clamber.contact.policy import DemoPolicy
 from clamber.contact.scaling import retarget
-from clamber.contact.steps import split_moves
+from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
@@ -100,7 +100,7 @@ def test_a_way_up_is_found_on_a_box_that_can_be_climbed(found):
 
 
 def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, ik):
-    steps, skipped = split_moves(sequence_of(ik.world, found), ik.world)
+    steps, skipped = split_steps(sequence_of(ik.world, found), ik.world)
     assert skipped == []
     for step, change in zip(steps, found.changes, strict=True):
         move = change.step
@@ -237,7 +237,7 @@ def test_what_is_gone_on_from_is_part_of_what_is_found(ik, goal, demo_plan):
     assert ended.arrived
     assert len(ended.changes) == 6
     assert ended.changes[:5] == made.changes
-    again = split_moves(sequence_of(ik.world, ended), ik.world)[0]
+    again = split_steps(sequence_of(ik.world, ended), ik.world)[0]
     surfaces = [s.makes.surface for s in again]
     assert surfaces[:5] == [c.step.makes.surface for c in made.changes]
     assert surfaces[5] == "RKnee"

@@ -9,7 +9,7 @@ import pytest
 
 from clamber.contact.contact import Contact
 from clamber.contact.scaling import retarget
-from clamber.contact.steps import Seeds, Step, split_moves
+from clamber.contact.steps import Seeds, Step, split_steps
 from clamber.errors import Status
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
@@ -55,7 +55,7 @@ def ik(coman):
 @pytest.fixture(scope="module")
 def steps(ik, demo_sequence):
     """Both hands, both elbows, both knees."""
-    steps, _ = split_moves(retarget(demo_sequence, ik.world), ik.world)
+    steps, _ = split_steps(retarget(demo_sequence, ik.world), ik.world)
     assert [s.makes.surface for s in steps] == [
         "LHand",
         "RHand",

@@ -11,7 +11,7 @@ import yaml
 
 from clamber import cli
 from clamber.contact.contact import Stance
-from clamber.contact.steps import split_moves
+from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.simulation import simulate
@@ -71,7 +71,7 @@ def described(contacts) -> list[str]:
 
 
 def done(made, sequence, stance) -> int:
-    steps = split_moves(sequence, made.world)[0]
+    steps = split_steps(sequence, made.world)[0]
     return steps_done(sequence, steps, stance, made.world)
 
 
@@ -158,7 +158,7 @@ def test_contacts_of_the_middle_are_of_the_moved_world(demo_plan):
 
 def test_each_limb_leaves_the_surface_that_it_is_on(demo_plan):
     world = demo_plan.world
-    steps = split_moves(demo_plan.sequence, world)[0]
+    steps = split_steps(demo_plan.sequence, world)[0]
     key = demo_plan.keyframes[2]
     # The left elbow has met the box where the hand was to be.
     other = tuple(
@@ -184,7 +184,7 @@ def test_each_limb_leaves_the_surface_that_it_is_on(demo_plan):
 
 def test_only_the_first_move_of_a_limb_is_another(demo_plan):
     world = demo_plan.world
-    steps = split_moves(demo_plan.sequence, world)[0]
+    steps = split_steps(demo_plan.sequence, world)[0]
     hand = [s for s in steps if s.limb == "left_arm"]
     on = demo_plan.keyframes[1].stance
     other = tuple(replace(c, surface="LElbow") for c in on if c.surface == "LHand")
@@ -437,7 +437,7 @@ def test_the_rest_has_its_alternatives_too(demo_plan, sore):
     assert "sore" in rest.fallback.reason
     assert rest.fallback.source == "alternatives"
     assert "LHand" in rest.fallback.surfaces
-    steps = split_moves(rest.sequence, rest.world)[0][rest.state.done :]
+    steps = split_steps(rest.sequence, rest.world)[0][rest.state.done :]
     made = [c.step for c in rest.changes]
     assert [s.makes.surface for s in steps] == [s.makes.surface for s in made]
     assert [s.index for s in steps] == [s.index for s in made]
@@ -452,7 +452,7 @@ def test_the_rest_that_was_searched_for_is_counted_from_standing(demo_plan, sore
     assert rest.fallback.source == "search"
     made = [c.step for c in rest.changes]
     assert rest.fallback.surfaces == tuple(s.makes.surface for s in made)
-    steps = split_moves(rest.sequence, rest.world)[0][rest.state.done :]
+    steps = split_steps(rest.sequence, rest.world)[0][rest.state.done :]
     assert [s.makes.surface for s in steps] == [s.makes.surface for s in made]
     assert [s.index for s in steps] == [s.index for s in made]
     assert [s.stance for s in steps] == [s.stance for s in made]

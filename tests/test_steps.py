@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.steps import SAME_PLACE, split_moves
+from clamber.contact.steps import SAME_PLACE, split_steps
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World, build_world
@@ -60,7 +60,7 @@ def sequence(*stances: str | list[Contact]) -> ContactSequence:
 
 
 def moves(world: World, *stances: str | list[Contact]) -> list[str]:
-    steps, _ = split_moves(sequence(*stances), world)
+    steps, _ = split_steps(sequence(*stances), world)
     return [f"{s.stance}: {s}" for s in steps]
 
 
@@ -162,7 +162,7 @@ def test_stances_are_split_into_steps_of_one_limb(world, name):
 
 def test_a_step_says_what_it_changes_and_where_it_leads(world):
     demo = sequence("LFoot RFoot", "LKnee RFoot", "LKnee RFoot LHand", "RFoot LHand")
-    (knee, hand, air), passed = split_moves(demo, world)
+    (knee, hand, air), passed = split_steps(demo, world)
     assert not passed
     assert (knee.limb, knee.breaks, knee.fixed) == ("left_leg", ("LFoot",), False)
     assert knee.makes is demo.stances[1].contact("LKnee")
@@ -178,7 +178,7 @@ def test_a_stance_that_is_no_keyframe_is_skipped_and_says_why(world):
         (air, "left leg in the air: part of its next move"),
         (hand, "no limb makes or leaves a bearing contact"),
     ):
-        (skipped,) = split_moves(sequence(*stances), world)[1]
+        (skipped,) = split_steps(sequence(*stances), world)[1]
         assert (skipped.stance, skipped.reason) == (2, reason)
 
 
@@ -205,7 +205,7 @@ def test_moves_done_in_order_lead_from_stance_to_stance(world, seed):
         shift = 0.1 * int(rng.integers(3))
         stances.append([contact(str(s), shift) for s in chosen if s is not None])
     demo = sequence(*stances)
-    steps, passed = split_moves(demo, world)
+    steps, passed = split_steps(demo, world)
     assert {s.stance for s in steps} | {s.stance for s in passed} == set(range(1, 9))
     assert [s.stance for s in steps] == sorted(s.stance for s in steps)
     down = {c.surface: c for c in demo.stances[0].contacts}
@@ -231,5 +231,5 @@ def test_moves_done_in_order_lead_from_stance_to_stance(world, seed):
 )
 def test_a_step_that_ends_on_the_feet_rises_if_it_is_the_last(world, last, stands_up):
     stances = ("LFoot RFoot", "LHand RHand LFoot RFoot", "RHand LFoot RFoot", last)
-    steps = split_moves(sequence(*stances), world)[0]
+    steps = split_steps(sequence(*stances), world)[0]
     assert [s.stands_up for s in steps] == [False] * (len(steps) - 1) + [stands_up]

@@ -10,7 +10,7 @@ import pytest
 
 from clamber import cli
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.steps import split_moves
+from clamber.contact.steps import split_steps
 from clamber.errors import Status
 from clamber.execution.simulation import simulate
 from clamber.execution.verdict import judge
@@ -164,7 +164,7 @@ def test_the_cost_is_the_way_to_each_contact_and_its_projected_distance(demo_pla
 
 def test_a_step_that_is_missed_costs_what_is_left_of_it(demo_plan):
     """The robot stands: nothing is made, all is left."""
-    steps = split_moves(demo_plan.sequence, demo_plan.world)[0]
+    steps = split_steps(demo_plan.sequence, demo_plan.world)[0]
     failures = tuple(Failure(status=Status.COLLIDING, step=s) for s in steps)
     none = replace(demo_plan, changes=(), failures=failures)
     kin, expected = Kinematics(demo_plan.world), 0.0
@@ -310,7 +310,7 @@ def test_where_no_alternative_is_stable_the_search_goes_on_from_the_farthest(
     save_plan(found, tmp_path)
     again = load_plan(tmp_path)
     assert again.fallback == found.fallback
-    steps = split_moves(again.sequence, again.world)[0]
+    steps = split_steps(again.sequence, again.world)[0]
     assert [s.makes.surface for s in steps] == made
 
 

@@ -85,7 +85,7 @@ class Skipped:
     __repr__ = short_repr
 
 
-def split_moves(
+def split_steps(
     sequence: ContactSequence, world: World
 ) -> tuple[list[Step], list[Skipped]]:
     """Split each change of stance into steps of one limb, or say why there is none.

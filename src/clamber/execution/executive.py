@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from clamber.contact.contact import Contact
-from clamber.contact.steps import split_moves
+from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.execution.balance import Balance
 from clamber.execution.estimate import LOST, TOUCH, Estimate
@@ -184,7 +184,7 @@ class Executive:
         self.done = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance: it has no steps to count.
         by_policy = plan.policy is not None
-        steps = [] if by_policy else split_moves(plan.sequence, plan.world)[0]
+        steps = [] if by_policy else split_steps(plan.sequence, plan.world)[0]
         self._steps = len(steps)
         self._reached = [float(plan.trajectory.keyframes[0])]  # [s] each keyframe
         self.left = len(plan.trajectory.time)

@@ -24,7 +24,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Region, Stance, region_of
 from clamber.contact.policy import GeneralPolicy
-from clamber.contact.steps import Step, on_feet, split_moves
+from clamber.contact.steps import Step, on_feet, split_steps
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
@@ -68,7 +68,7 @@ def action_counts(sequence: ContactSequence, world: World) -> Counts:
     """
     counts: Counter[tuple[Region, str]] = Counter()
     stance = sequence.stances[0].contacts
-    for step in split_moves(sequence, world)[0]:
+    for step in split_steps(sequence, world)[0]:
         if step.makes is not None:
             counts[region_of(stance), step.makes.surface] += 1
         stance = _after(stance, step)

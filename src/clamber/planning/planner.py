@@ -21,7 +21,7 @@ import numpy as np
 from clamber.contact.contact import ContactSequence, Stance
 from clamber.contact.policy import GeneralPolicy
 from clamber.contact.scaling import retarget
-from clamber.contact.steps import split_moves
+from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.model.records import short_repr
 from clamber.model.robot import Robot
@@ -280,7 +280,7 @@ class _Task:
         """The steps of a sequence that are left, with so many of the weights."""
         world, state = self._ik.world, self._state
         goal = retarget(sequence, world)
-        steps, skipped = split_moves(goal, world)
+        steps, skipped = split_steps(goal, world)
         if state is not None:
             if proposer != "demonstrated":
                 done = steps_done(goal, steps, state.stance, world)

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.steps import Step, split_moves
+from clamber.contact.steps import Step, split_steps
 from clamber.errors import InputError, Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
@@ -143,7 +143,7 @@ def state_of(
             "a posture with a surface on a support", source=source, field="contacts"
         )
     stance = tuple(contacts)
-    steps = split_moves(plan.sequence, plan.world)[0]
+    steps = split_steps(plan.sequence, plan.world)[0]
     done = steps_done(plan.sequence, steps, stance, plan.world)
     return State(stance=stance, loaded=stance, q=q, done=done)
 
@@ -267,5 +267,5 @@ def from_standing(
     whole = replace(
         sequence, stances=tuple(stances), t=np.arange(len(stances) + 1, dtype=float)
     )
-    steps = split_moves(whole, ik.world)[0]
+    steps = split_steps(whole, ik.world)[0]
     return whole, sum(s.stance <= before for s in steps)
