@@ -16,10 +16,10 @@ from clamber.execution.estimate import (
     TOUCH,
     Estimate,
 )
+from clamber.execution.probe import REACH
 from clamber.execution.sensors import Measurement
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
-from clamber.planning.adaptation import REACH
 
 UP = np.array([0.0, 0.0, 1.0])
 

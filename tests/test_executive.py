@@ -36,6 +36,7 @@ from clamber.execution.executive import (
     Executive,
     OpenLoop,
 )
+from clamber.execution.probe import PROBE_SPEED, REACH
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import JointServo, self_positioning_joints
 from clamber.execution.simulation import has_fallen, simulate
@@ -44,7 +45,6 @@ from clamber.execution.verdict import END_SPEED, Figure, judge
 from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_from_yaw, quat_multiply
 from clamber.model.world import PHYSICS_STEP
-from clamber.planning.adaptation import FEELING_SPEED, REACH
 from clamber.planning.planner import timed
 from clamber.planning.trajectory import HOLD_END, HOLD_START
 from clamber.step.change import Failure
@@ -245,7 +245,7 @@ def test_where_nothing_is_found_the_robot_stops_and_says_why(hands_plan, gone):
     assert not judge(hands_plan, gone).criteria[Figure.WENT_ON].ok
     # It has probed as deep as it may.
     time = missing.time
-    before = np.arange(time - REACH / FEELING_SPEED - 1.0, time, 0.02)
+    before = np.arange(time - REACH / PROBE_SPEED - 1.0, time, 0.02)
     low = min(point_at(gone, t, "LHand")[2] for t in before)
     assert TOP - REACH - 5e-3 < low < TOP - REACH + 0.01
     # Another place is looked for from where it began to probe.
@@ -512,7 +512,7 @@ def test_a_contact_that_carries_nothing_is_probed_for_again(fast_plan, found):
     told, kin = Told(fast_plan), Kinematics(fast_plan.world)
     hand, top = told.surfaces.index("LHand"), fast_plan.world.supports["box"]
     touch, end = touch_of(fast_plan, 1), end_of(fast_plan, 1)
-    low = 0.0  # how far below the top the hand has been
+    low, since = 0.0, 0  # how far below the top the hand has been, and since when
     for _ in range(end + 8000):
         kin.update(told.executive.reference)
         below = -float(top.height(kin.contact_point("LHand", UP)))
@@ -522,7 +522,8 @@ def test_a_contact_that_carries_nothing_is_probed_for_again(fast_plan, found):
             force[hand] = [0.0, 0.0, 30.0] if there else 0.0
             low = max(low, below)
         told.tick(force=force)
-        if len(told.events) == 2 or (found and low > 0.5 * DEVIATION + 1e-3):
+        since += found and low > 0.5 * DEVIATION
+        if len(told.events) == 2 or since == 200:
             break
     assert kinds(told.events) == ([Lost] if found else [Lost, GivenUp])
     assert {e.surface for e in told.events} == {"LHand"}

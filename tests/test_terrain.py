@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from clamber.execution.terrain import (
     CAUTION,
-    FELT_SIGMA,
+    CONTACT_SIGMA,
     HEIGHT_SIGMA,
     ROUGHNESS,
     SLOPE_SIGMA,
@@ -57,7 +57,7 @@ def fitted_plane(before: Box, after: Box) -> np.ndarray:
 def posterior(xy: np.ndarray, z: np.ndarray, rough: float) -> np.ndarray:
     """(3,) by the normal equations of a ridge regression."""
     X = np.column_stack([np.ones(len(xy)), xy])
-    s2 = FELT_SIGMA**2 + rough**2
+    s2 = CONTACT_SIGMA**2 + rough**2
     A = np.vstack([X / np.sqrt(s2), np.diag(1.0 / PRIOR)])
     y = np.concatenate([z / np.sqrt(s2), np.zeros(3)])
     return np.linalg.lstsq(A, y, rcond=None)[0]
@@ -66,7 +66,7 @@ def posterior(xy: np.ndarray, z: np.ndarray, rough: float) -> np.ndarray:
 def most_probable(xy: np.ndarray, z: np.ndarray) -> float:
     """The roughness under which the heights are likeliest."""
     X = np.column_stack([np.ones(len(xy)), xy]) * PRIOR
-    noise = [(FELT_SIGMA**2 + s * s) * np.eye(len(z)) for s in ROUGHNESS]
+    noise = [(CONTACT_SIGMA**2 + s * s) * np.eye(len(z)) for s in ROUGHNESS]
     p = [multivariate_normal.logpdf(z, cov=X @ X.T + N) for N in noise]
     return ROUGHNESS[int(np.argmax(p))]
 
@@ -99,14 +99,6 @@ def test_the_fit_is_the_maximum_of_the_posterior(rng, spread, rpy):
     assert np.allclose(fitted_plane(box, after), posterior(spread, z, 0.0), atol=1e-9)
 
 
-def test_one_point_in_the_middle_moves_the_height_alone():
-    box = box_at()
-    after = fitted_box(box, on_top(box, [[0.0, 0.0, 0.04]]))
-    share = HEIGHT_SIGMA**2 / (HEIGHT_SIGMA**2 + FELT_SIGMA**2)
-    assert np.allclose(fitted_plane(box, after), [0.04 * share, 0.0, 0.0], atol=1e-12)
-    assert share > 0.98  # it is believed
-
-
 def test_one_point_at_the_near_edge_is_height_more_than_slope():
     box, xy, z = box_at(), np.array([[-0.4, 0.0]]), np.array([0.04])
     after = fitted_box(box, on_top(box, [[-0.4, 0.0, 0.04]]))
@@ -116,13 +108,6 @@ def test_one_point_at_the_near_edge_is_height_more_than_slope():
     assert b < 0.0  # ... the far end may be as it was
     assert c == pytest.approx(0.0, abs=1e-12)
     assert abs(a - 0.4 * b - 0.04) < 1.5e-3  # the top goes through the point
-
-
-def test_points_where_the_top_was_believed_leave_it_there(spread):
-    box = box_at((0.0, 0.1, 0.4))
-    after = fitted_box(box, plane(box, (0.0, 0.0, 0.0), spread))
-    assert np.allclose(after.position, box.position, atol=1e-12)
-    assert np.allclose(after.rotation, box.rotation, atol=1e-12)
 
 
 def test_what_was_not_felt_of_a_box_stays_as_it_was(spread):
@@ -137,16 +122,6 @@ def test_what_was_not_felt_of_a_box_stays_as_it_was(spread):
     turn = Rotation.from_matrix(after.rotation @ box.rotation.T).magnitude()
     between = np.arccos(after.top.normal @ box.top.normal)
     assert turn == pytest.approx(between, abs=1e-9)
-
-
-def test_the_order_of_contacts_does_not_matter(rng, spread):
-    box = box_at()
-    z = rng.normal(0.0, 0.02, len(spread))
-    points = on_top(box, np.column_stack([spread, z]))
-    a, b = fitted_box(box, points), fitted_box(box, points[rng.permutation(len(z))])
-    assert np.allclose(a.position, b.position, atol=1e-12)
-    assert np.allclose(a.rotation, b.rotation, atol=1e-12)
-    assert a.roughness == pytest.approx(b.roughness)
 
 
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 1.1), (0.2, -0.1, 2.5)], ids=str)
@@ -191,13 +166,6 @@ def test_near_contacts_that_contradict_make_a_rough_top_not_a_steep_one():
     assert abs(steep[2]) > 0.1
 
 
-def test_far_contacts_of_the_same_difference_make_a_slope():
-    box = box_at()
-    after = fitted_box(box, on_top(box, [[-0.35, -0.5, 0.015], [-0.35, 0.5, -0.015]]))
-    assert after.roughness == CAUTION
-    assert fitted_plane(box, after)[2] == pytest.approx(-0.03, abs=2e-3)
-
-
 @pytest.mark.parametrize("seed", range(30))
 @pytest.mark.parametrize("n", [2, 4, 9])
 def test_of_a_rough_top_no_contact_lies_below_nor_higher_than_it_is_rough(seed, n):
@@ -233,7 +201,7 @@ def test_the_roughness_that_contacts_were_drawn_with_is_found(rough):
         rng = np.random.default_rng([seed, 7])
         box, xy = box_at(), rng.uniform(-0.45, 0.45, (60, 2))
         a, b, c = rng.normal(0.0, PRIOR)
-        z = a + xy @ [b, c] + rng.normal(0.0, np.hypot(FELT_SIGMA, rough), len(xy))
+        z = a + xy @ [b, c] + rng.normal(0.0, np.hypot(CONTACT_SIGMA, rough), len(xy))
         after = fitted_box(box, on_top(box, np.column_stack([xy, z])))
         points = on_top(box, np.column_stack([xy, z]))
         plain = posterior(xy, z, rough)

@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.execution.probe import REACH
 from clamber.execution.sensors import Measurement
 from clamber.execution.terrain import believed_scene
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import PHYSICS_STEP, World
-from clamber.planning.adaptation import REACH
 from clamber.planning.start import measured_contact
 
 TOUCH = 10.0  # [N] normal force that is a contact

@@ -44,6 +44,7 @@ from clamber.execution.events import (
     Stopped,
     Unintended,
 )
+from clamber.execution.probe import REACH, guarded_move
 from clamber.execution.reference import Reference, Ticks
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import JointServo, SelfPositioning
@@ -57,7 +58,6 @@ from clamber.execution.unintended import (
 from clamber.model.scene import Scene
 from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, limb_links
-from clamber.planning.adaptation import REACH, feeling
 from clamber.planning.planner import plan
 from clamber.planning.records import Budget, Plan, State
 from clamber.planning.trajectory import HOLD_END, HOLD_START, Trajectory
@@ -445,7 +445,7 @@ class Executive:
             stance = tuple(x for x in stance if x.surface in after)
         held = tuple(x for x in stance if x.surface != c.surface)
         ref, estimate = self._ref, self.estimate
-        t = feeling(estimate.world, held, c, ref.trajectory.q[ref.i])
+        t = guarded_move(estimate.world, held, c, ref.trajectory.q[ref.i])
         ref.left_plan = True
         found: Contact | None = None
 

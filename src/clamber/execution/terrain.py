@@ -1,6 +1,6 @@
-"""Contacts that were felt -> what boxes are believed to be like.
+"""Contacts that were measured -> what boxes are believed to be like.
 
-Heights felt over a box's top are modelled as a plane plus the roughness of the surface,
+Heights measured over a box's top are a plane plus the roughness of the surface,
 
     z_i = a + b x_i + c y_i + e_i,    a, b, c ~ normal priors,    e_i ~ N(0, s^2),
 
@@ -23,17 +23,17 @@ from clamber.model.se3 import matrix_from_quat
 
 HEIGHT_SIGMA = 0.05  # [m] what is expected of a box's height
 SLOPE_SIGMA = 0.12  # [rad] ... and of its slopes
-FELT_SIGMA = 0.006  # [m] how well a contact's height is felt on a smooth top
-CAUTION = 0.02  # [m] least distance more from a top that was felt
+CONTACT_SIGMA = 0.006  # [m] how well a contact's height is measured on a smooth top
+CAUTION = 0.02  # [m] least distance more from a top that was measured
 ROUGHNESS = (0.0, 0.010, 0.020, 0.035)  # [m] that a top may have
 
 
 def fitted_box(box: Box, points: np.ndarray) -> Box:
-    """The box with its top, and the top's roughness, as contacts were felt.
+    """The box with its top, and the top's roughness, as contacts were measured.
 
     Args:
         box: As it was believed.
-        points: (n, 3) felt on its top, in the world, n >= 1.
+        points: (n, 3) measured on its top, in the world, n >= 1.
     """
     top = box.top
     local = (points - top.position) @ top.rotation
@@ -42,7 +42,7 @@ def fitted_box(box: Box, points: np.ndarray) -> Box:
     prior = np.diag([HEIGHT_SIGMA, SLOPE_SIGMA, SLOPE_SIGMA]) ** 2
     fits = []
     for rough in ROUGHNESS:
-        C = X @ prior @ X.T + (FELT_SIGMA**2 + rough**2) * np.eye(len(z))
+        C = X @ prior @ X.T + (CONTACT_SIGMA**2 + rough**2) * np.eye(len(z))
         w = np.linalg.solve(C, z)
         evidence = -0.5 * (z @ w + np.linalg.slogdet(C)[1])
         fits.append((evidence, rough, prior @ X.T @ w))
@@ -62,15 +62,15 @@ def fitted_box(box: Box, points: np.ndarray) -> Box:
     )
 
 
-def believed_scene(scene: Scene, felt: Iterable[tuple[str, np.ndarray]]) -> Scene:
-    """The scene with its boxes fitted to the contacts felt on them.
+def believed_scene(scene: Scene, measured: Iterable[tuple[str, np.ndarray]]) -> Scene:
+    """The scene with its boxes fitted to the contacts measured on them.
 
     Args:
         scene: As it was planned for.
-        felt: Support and (3,) point of each contact.
+        measured: Support and (3,) point of each contact.
     """
     points: dict[str, list[np.ndarray]] = {}
-    for support, p in felt:
+    for support, p in measured:
         points.setdefault(support, []).append(p)
     return replace(
         scene,

@@ -9,13 +9,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.world import World, limb_links
-from clamber.planning.trajectory import (
-    HOLD_END,
-    HOLD_START,
-    RATE,
-    Trajectory,
-    build_trajectory,
-)
+from clamber.planning.trajectory import Trajectory, build_trajectory
 from clamber.step.ik import IK
 from clamber.step.path import ARC_WEIGHT, Phase
 from clamber.step.stability import contact_points
@@ -23,14 +17,14 @@ from clamber.step.statics import com_margin, support_polygon
 from clamber.step.tasks import reaching
 from clamber.step.transition import balance_problem
 
-REACH = 0.12  # [m] a contact is looked for this far from where it was planned
-FEELING_SPEED = 0.06  # [m/s] along the normal
-FEELING_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
-FEELING_DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
+REACH = 0.12  # [m] a contact is probed for this far from where it was planned
+PROBE_SPEED = 0.06  # [m/s] along the normal
+PROBE_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
+DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
 
-def feeling(
+def guarded_move(
     world: World, held: tuple[Contact, ...], contact: Contact, q: np.ndarray
 ) -> Trajectory | None:
     """A reference that goes on along the normal beyond where a contact was planned.
@@ -52,9 +46,9 @@ def feeling(
     room = com_margin(ik.kin.com[:2], support_polygon(points))
     if room <= 0:
         return None
-    low, high = FEELING_MARGIN
+    low, high = PROBE_MARGIN
     margins = (float(np.clip(room, low, high)), low)
-    nodes, depths = _nodes_below(ik, held, contact, q, free, margins)
+    nodes, depths = nodes_below(ik, held, contact, q, free, margins)
     if len(nodes) == 1:
         return None
     phase = Phase(
@@ -66,9 +60,9 @@ def feeling(
     )
     # No part of the way is faster than it should be, however far its nodes are apart.
     travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).max(axis=1)
-    speed = max(FEELING_SPEED * float((travel / np.diff(depths)).min()), 1e-3)
+    speed = max(PROBE_SPEED * float((travel / np.diff(depths)).min()), 1e-3)
     t = build_trajectory(world, [phase], speed=speed)
-    a, b = round(HOLD_START * RATE), len(t.time) - round(HOLD_END * RATE)
+    a, b = t.segments[1].begin, t.segments[1].end  # without what is held
     cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
     # Between two postures at a joint's limit the spline passes it by a little.
     low, high = world.q_min[world.dadr], world.q_max[world.dadr]
@@ -80,7 +74,7 @@ def feeling(
     return replace(t, time=t.time[: b - a], segments=(), **cut)
 
 
-def _nodes_below(
+def nodes_below(
     ik: IK,
     held: tuple[Contact, ...],
     contact: Contact,
@@ -99,7 +93,7 @@ def _nodes_below(
     p = ik.kin.contact_point(contact.surface, support.normal)
     top = p - support.normal * float((p - contact.position) @ support.normal)
     nodes, depths = [q], [0.0]
-    for depth in FEELING_DEPTHS:
+    for depth in DEPTHS:
         node = None
         while node is None and margins:
             wanted = top - depth * support.normal
