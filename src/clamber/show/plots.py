@@ -222,7 +222,8 @@ def _draw_table(ax: Axes, demo: DemoPolicy) -> None:
             break
         _arrow(ax, (x + 0.22, y), (x + 0.78, y))
         action = demo.actions[i]
-        look = {"color": "0.55", "style": "italic"} if i not in ruling else {}
+        weak = {"color": "0.55", "style": "italic"}
+        look: dict[str, Any] = {} if i in ruling else weak
         text = "gives up" if action is None else action
         ax.text(x + 0.5, y + 0.1, text, ha="center", fontsize=6.5, **look)
     rows = math.ceil(len(demo.states) / PER_ROW)
