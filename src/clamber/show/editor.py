@@ -19,6 +19,7 @@ from clamber.contact.steps import same_place
 from clamber.errors import ClamberError
 from clamber.execution.simulation import Rollout, simulate
 from clamber.execution.verdict import Verdict, judge
+from clamber.model.records import short_repr
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning import planner
 from clamber.planning.records import Plan, Progress
@@ -53,6 +54,8 @@ class Interval:
     first: int
     last: int
     planned: np.ndarray
+
+    __repr__ = short_repr
 
 
 def intervals_of(plan: Plan) -> dict[str, Interval]:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber.model.records import short_repr
+
 SLICES, FEWEST_SLICES = 28, 6  # around a round geom
 SHOWN_GROUPS = (0, 1, 2)  # of geoms, in MuJoCo's viewer
 MAX_TRIANGLES = 60_000  # of all mesh geoms together
@@ -41,6 +43,8 @@ class Mesh:
     normals: np.ndarray
     colours: np.ndarray
     triangles: np.ndarray
+
+    __repr__ = short_repr
 
 
 def body_poses(data: mujoco.MjData, meshes: Sequence[Mesh]) -> np.ndarray:

@@ -22,6 +22,7 @@ from clamber.contact.steps import Step
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.scene import Support
 from clamber.model.world import World
 from clamber.planning.records import Plan
@@ -81,6 +82,8 @@ class Run:
     timings: Mapping[str, Any] = field(default_factory=dict)
     plan: Plan | None = None
     rollout: Rollout | None = None
+
+    __repr__ = short_repr
 
     def attempt(self, load: Callable[[], _Loaded]) -> _Loaded | None:
         """What `load` returns; None, and a sentence more, where it cannot."""
@@ -305,6 +308,8 @@ class Motion:
     loads: list[list[tuple[float, float]]] | None
     events: list[float]
     felt: list[float]
+
+    __repr__ = short_repr
 
     @property
     def bears(self) -> np.ndarray:

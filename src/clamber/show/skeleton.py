@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clamber.contact.contact import ContactInterval, ContactSequence
+from clamber.model.records import short_repr
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import SIDES, Demonstration, wrist
@@ -36,6 +37,8 @@ class Skeleton:
     seen: np.ndarray
     bones: np.ndarray
     head: int | None
+
+    __repr__ = short_repr
 
     def at(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Points (F, 3) [m] at a time [s], its ends outside of it; seen: (F,) bool."""
