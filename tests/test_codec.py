@@ -29,12 +29,12 @@ from clamber.model.world import Surface, World
 from clamber.planning.records import Fallback, Iteration, Plan, State, Tried
 from clamber.planning.trajectory import Samples, Trajectory
 from clamber.run.codec import (
-    Arrays,
     At,
     Codec,
     Form,
     parse,
     read_json,
+    read_npz,
     whole_file,
     write_json,
     write_npz,
@@ -138,7 +138,7 @@ things = st.deferred(
 
 def through_text(codec: Codec, x: Any, kind: Any) -> Any:
     text = json.dumps(codec.encode(x), allow_nan=False)
-    return codec.decode(kind, At(parse(text, HERE), HERE))
+    return codec.decode(kind, At(parse(text, At(None, HERE)), HERE))
 
 
 @given(things)
@@ -321,11 +321,11 @@ def test_what_is_no_npz_is_refused(tmp_path: Path):
     for content in (b"", b"no zip", whole[: len(whole) // 2]):
         path.write_bytes(content)
         with pytest.raises(InputError, match="`clamber plan` writes it"):
-            Arrays(path, maker="`clamber plan` writes it")
+            read_npz(path, maker="`clamber plan` writes it")
     with path.open("wb") as stream:
         np.save(stream, np.zeros(3))
     with pytest.raises(InputError, match="a whole"):
-        Arrays(path, maker="")
+        read_npz(path, maker="")
 
 
 def test_what_is_sampled_is_written_as_its_array(tmp_path: Path):

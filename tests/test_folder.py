@@ -420,7 +420,7 @@ def test_a_folder_that_is_none_is_named(tmp_path: Path):
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"qpos": np.zeros((7, 3))}, "shape of qpos"),
+        ({"qpos": np.zeros((7, 3))}, "qpos"),
         ({"joint_names": np.array(["Tail"] * 23)}, "joint_names"),
         ({"qvel": None}, "qvel"),
     ],
@@ -517,7 +517,7 @@ def test_a_broken_rollout_is_named(plan: Plan, rollout: Rollout, copied: Path):
 
     assert fault() == (copied / ROLLOUT, None)
     save_rollout(plan, replace(rollout, qpos=rollout.qpos[1:]), copied)
-    assert fault() == (copied / ROLLOUT, "shape of qpos")
+    assert fault() == (copied / ROLLOUT, "qpos")
     save_rollout(plan, rollout, copied)
     (copied / TRAJECTORY).unlink()
     assert fault() == (copied / TRAJECTORY, None)

@@ -286,7 +286,7 @@ def test_another_robots_rollout_is_not_mistaken_for_this_ones(run: Path):
     arrays["qpos"] = arrays["qpos"][:, :-3]
     np.savez(run / "rollout.npz", **arrays)
     record = report.run_record(run)
-    assert record["missing"][0].startswith("rollout.npz: shape of qpos")
+    assert record["missing"][0].startswith("rollout.npz: qpos is")
     assert record["motion"]["loads"] is None
 
 

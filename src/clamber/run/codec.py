@@ -263,7 +263,8 @@ class Codec:
     def from_arrays(
         self,
         kind: type,
-        arrays: Arrays,
+        arrays: Mapping[str, np.ndarray],
+        file: Path,
         shapes: Mapping[str, tuple[str | int, ...]],
         without: Collection[str] = (),
     ) -> dict[str, Any]:
@@ -271,7 +272,8 @@ class Codec:
 
         Args:
             kind: The record.
-            arrays: Of the file.
+            arrays: Of the file, by key.
+            file: That they are from.
             shapes: Sizes by key: numbers, or names of which the first array that has
                 one says how much it is.
             without: Fields that are not in the file.
@@ -281,19 +283,37 @@ class Codec:
         sizes: dict[str, int] = {}
         for f in fields(kind):
             key, hint = names.get(f.name, f.name), _hints(kind)[f.name]
-            if f.name in without or (key not in arrays and f.default is None):
+            at, x = At(None, file, key), arrays.get(key)
+            if f.name in without or (x is None and f.default is None):
                 continue
-            x = arrays.get(key, shapes.get(key, ()), sizes)
+            if x is None:
+                raise at.error("an array: there is none")
+            _check_shape(
+                x, shapes.get(key, ()), sizes, At(None, file, f"shape of {key}")
+            )
+            if x.dtype.kind == "f" and not np.all(np.isfinite(x)):
+                raise at.error("finite numbers only")
             if np.ndarray in _arms(hint):
                 out[f.name] = x
             elif hint == tuple[str, ...]:
                 out[f.name] = tuple(x.tolist())
             elif get_origin(hint) is tuple:
-                at = At(parse(x.item(), arrays.file, key), arrays.file, key)
-                out[f.name] = self.decode(hint, at)
+                out[f.name] = self.decode(hint, At(parse(x.item(), at), file, key))
             else:
                 out[f.name] = hint(x.item())
         return out
+
+
+def _check_shape(
+    x: np.ndarray, shape: tuple[str | int, ...], sizes: dict[str, int], at: At
+) -> None:
+    """Refuse another shape; sizes that are not known yet are those of this array."""
+    if len(shape) == x.ndim:
+        for size, n in zip(shape, x.shape, strict=True):
+            sizes.setdefault(str(size), n if isinstance(size, str) else size)
+    wanted = tuple(sizes.get(str(size), size) for size in shape)
+    if x.shape != wanted:
+        raise at.error(f"the shape ({', '.join(map(str, wanted))})", x.shape)
 
 
 @functools.cache
@@ -371,7 +391,7 @@ def _text(x: Any, before: str = "\n") -> str:
     return json.dumps(x, allow_nan=False)
 
 
-def parse(text: str, file: Path, field: str = "", *, maker: str = "") -> Any:
+def parse(text: str, at: At, maker: str = "") -> Any:
     """What a text of JSON says, whose numbers are finite.
 
     Raises:
@@ -384,7 +404,7 @@ def parse(text: str, file: Path, field: str = "", *, maker: str = "") -> Any:
     try:
         return json.loads(text, parse_constant=refuse)
     except ValueError as e:
-        raise At(None, file, field).error(f"whole JSON ({e}); {maker}") from e
+        raise at.error(f"whole JSON ({e}); {maker}") from e
 
 
 def read_json(path: Path, *, maker: str, versions: Collection[int] = (VERSION,)) -> At:
@@ -404,7 +424,7 @@ def read_json(path: Path, *, maker: str, versions: Collection[int] = (VERSION,))
         raise unreadable(path, e, maker) from e
     except ValueError as e:
         raise InputError(f"a JSON file ({e}); {maker}", path) from e
-    at = At(parse(text, path, maker=maker), path)
+    at = At(parse(text, At(None, path), maker), path)
     version = at.object().get("version", "absent")
     if version not in versions:
         old = ": clamber 0.1 made this file" if version == 1 else ""
@@ -430,55 +450,17 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
                     file.write(block.astype("<f8").tobytes())
 
 
-class Arrays:
-    """The arrays of an `.npz`; what is missing or of another shape is the user's."""
+def read_npz(path: Path, *, maker: str) -> dict[str, np.ndarray]:
+    """The arrays of an `.npz`.
 
-    def __init__(self, file: Path, *, maker: str) -> None:
-        """Read all of them; `maker` says what to do where they cannot be read."""
-        self.file = file
-        try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as f:
-                self._arrays = {k: f[k] for k in f.files}
-        except _BROKEN as e:
-            reason = e.strerror if isinstance(e, OSError) and e.strerror else e
-            if "pickle" in str(e):  # what numpy takes any other content for
-                reason = "it holds something else"
-            raise InputError(f"a whole .npz file ({reason}); {maker}", file) from e
-
-    def __contains__(self, name: str) -> bool:
-        """Whether there is one of that name."""
-        return name in self._arrays
-
-    def get(
-        self, name: str, shape: tuple[str | int, ...], sizes: dict[str, int]
-    ) -> np.ndarray:
-        """An array of finite numbers, or of names.
-
-        Args:
-            name: Its key.
-            shape: Numbers, or names of sizes.
-            sizes: Of names; those that are not known yet are those of this array.
-
-        Raises:
-            InputError: There is none of that shape.
-        """
-        if name not in self._arrays:
-            raise InputError("an array: there is none", self.file, name)
-        x = self._arrays[name]
-        if len(shape) == x.ndim:
-            for size, n in zip(shape, x.shape, strict=True):
-                if isinstance(size, str):
-                    sizes.setdefault(size, n)
-        wanted = tuple(sizes.get(n, n) if isinstance(n, str) else n for n in shape)
-        if x.shape != wanted:
-            text = f"({', '.join(map(str, wanted))})"
-            raise InputError(text, self.file, f"shape of {name}", x.shape)
-        if x.dtype.kind == "f" and not np.all(np.isfinite(x)):
-            raise InputError("finite numbers only", self.file, name)
-        return x
-
-    def same(self, name: str, wanted: tuple[str, ...]) -> None:
-        """Refuse names that are not those of the world."""
-        if (found := tuple(self._arrays[name].tolist())) != wanted:
-            expected = f"those of the scene, {', '.join(wanted)}"
-            raise InputError(expected, self.file, name, ", ".join(map(str, found)))
+    Raises:
+        InputError: It cannot be read; `maker` says what to do then.
+    """
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as f:
+            return {k: f[k] for k in f.files}
+    except _BROKEN as e:
+        reason = e.strerror if isinstance(e, OSError) and e.strerror else e
+        if "pickle" in str(e):  # what numpy takes any other content for
+            reason = "it holds something else"
+        raise InputError(f"a whole .npz file ({reason}); {maker}", path) from e

@@ -15,7 +15,7 @@ import hashlib
 import importlib.metadata
 import json
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -40,9 +40,9 @@ from clamber.planning.records import Fallback, Plan
 from clamber.planning.trajectory import Trajectory
 from clamber.run.codec import (
     VERSION,
-    Arrays,
     At,
     read_json,
+    read_npz,
     whole_file,
     write_json,
     write_npz,
@@ -325,16 +325,24 @@ def load_trajectory(path: str | Path, world: World) -> Trajectory:
         InputError: It is missing, broken or another robot's.
     """
     m, na, ns = world.model, len(world.joints), len(world.surfaces)
-    f = Arrays(Path(path), maker=_maker(Path(path)))
+    path = Path(path)
     shapes = {
         **{"time": ("T",), "qpos": ("T", m.nq), "qvel": ("T", m.nv)},
         **{"tau": ("T", na), "contact": ("T", ns), "keyframes": ("K",)},
         **{"joint_names": (na,), "surfaces": (ns,)},
     }
-    read = CODEC.from_arrays(Trajectory, f, shapes)
-    f.same("joint_names", world.joints)
-    f.same("surfaces", tuple(world.surfaces))
-    return Trajectory(**read)
+    arrays = read_npz(path, maker=_maker(path))
+    read = Trajectory(**CODEC.from_arrays(Trajectory, arrays, path, shapes))
+    _check_names(At(read.joints, path, "joint_names"), world.joints)
+    _check_names(At(read.surfaces, path, "surfaces"), world.surfaces)
+    return read
+
+
+def _check_names(found: At, wanted: Iterable[str]) -> None:
+    """Refuse names that are not those of the scene."""
+    if found.value != tuple(wanted):
+        expected = f"those of the scene, {', '.join(wanted)}"
+        raise found.error(expected, ", ".join(map(str, found.value)))
 
 
 def save_timings(folder: str | Path, seconds: Mapping[str, float]) -> None:
@@ -478,7 +486,7 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     """
     folder = Path(folder)
     path = folder / ROLLOUT
-    f = Arrays(path, maker=_maker(path))
+    arrays = read_npz(path, maker=_maker(path))
     plan = _read(folder / PLAN)
     scene, written = plan.key("sequence").key("scene"), {}
     if with_events:
@@ -494,8 +502,8 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
         **{"unintended": ("M",), "penetration": ("M",), "end_speed": ("n",)},
         **{"contact_step": ("K",), "contact_geoms": ("K", 2), "contact_load": ("K", 2)},
     }
-    read = CODEC.from_arrays(Rollout, f, shapes, without=_NOT_IN_ROLLOUT)
-    f.same("surfaces", surfaces)
+    read = CODEC.from_arrays(Rollout, arrays, path, shapes, without=_NOT_IN_ROLLOUT)
+    _check_names(At(read["surfaces"], path, "surfaces"), surfaces)
     path, planned = folder / TRAJECTORY, folder / PLANNED_TRAJECTORY
     both = path.exists() and planned.exists()
     as_planned = both and filecmp.cmp(path, planned, shallow=False)
