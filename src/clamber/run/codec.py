@@ -288,9 +288,7 @@ class Codec:
                 continue
             if x is None:
                 raise at.error("an array: there is none")
-            _check_shape(
-                x, shapes.get(key, ()), sizes, At(None, file, f"shape of {key}")
-            )
+            _check_shape(x, shapes.get(key, ()), sizes, at)
             if x.dtype.kind == "f" and not np.all(np.isfinite(x)):
                 raise at.error("finite numbers only")
             if np.ndarray in _arms(hint):
