@@ -16,7 +16,8 @@ from clamber.model.scene import GROUND, Scene
 from clamber.model.world import build_world
 from clamber.planning.gait import Gait
 from clamber.planning.planner import plan
-from clamber.planning.records import Plan, PlanOptions
+from clamber.planning.records import Budget, Plan, PlanOptions
+from clamber.planning.search import Search
 from clamber.planning.traverse import (
     PATIENCE,
     cost_to_go,
@@ -35,10 +36,7 @@ from conftest import stairs
 from test_gait import FEET, POLICY, ROBOT, contact, row, table
 
 OPTIONS = PlanOptions()
-
-
-def quiet(stage: str, share: float, note: str) -> None:
-    """Nobody listens."""
+NO_IK: IK = None  # nothing is tried
 
 
 def assert_contacts_are_kept(plan: Plan) -> None:
@@ -63,7 +61,7 @@ class Scripted:
 
     def __init__(self, answers, goal=(1.0, 0.0)) -> None:
         self.gait = SimpleNamespace(goal=np.array(goal))
-        self.options, self.asked = OPTIONS, 0
+        self.search, self.asked = Search(NO_IK, OPTIONS), 0
         self._answers = answers
 
     def next_changes(self, key):
@@ -88,38 +86,41 @@ def test_contacts_that_come_back_to_where_they_were_end_it():
     back, ahead = knees_at(0.6), knees_at(0.7)
     swapped = SimpleNamespace(stance=back.stance[::-1])
     to_and_fro = Scripted(lambda key, _: swapped if key is ahead else ahead)
-    route = follow([to_and_fro], back, 100, quiet).route
+    route = follow([to_and_fro], back, 100).route
     assert (route.arrived, len(route.changes)) == (False, 3)  # and ahead again
     assert "to and fro" in str(route.failures[0])
     # Other surfaces there are not the same.
     fewer = SimpleNamespace(stance=back.stance[:1])
     none = Scripted(lambda key, k: (ahead, fewer, None)[k - 1])
-    assert follow([none], back, 100, quiet).route.arrived
+    assert follow([none], back, 100).route.arrived
 
 
 def test_going_on_without_getting_nearer_is_given_up():
     away = Scripted(lambda key, k: knees_at(0.6 - 0.02 * k))
-    route = follow([away], knees_at(0.6), 1000, quiet).route
+    route = follow([away], knees_at(0.6), 1000).route
     assert len(route.changes) == PATIENCE + 1
     assert "no nearer to the goal" in str(route.failures[0])
 
 
 def test_it_is_cut_short_without_a_failure_and_ends_where_it_arrives():
     nearer = Scripted(lambda key, k: knees_at(0.1 * k))
-    route = follow([nearer], knees_at(0.0), 4, quiet).route
+    route = follow([nearer], knees_at(0.0), 4).route
     assert (len(route.changes), route.arrived, route.failures) == (4, False, ())
-    nearer.options = replace(OPTIONS, max_changes=4)
-    route = follow([nearer], knees_at(0.0), 4, quiet).route
+    nearer.search = Search(NO_IK, replace(OPTIONS, max_changes=4))
+    route = follow([nearer], knees_at(0.0), 4).route
     assert "4 contact changes were not enough" in str(route.failures[0])
+    nearer.search = Search(NO_IK, OPTIONS, Budget(seconds=0.0))
+    route = follow([nearer], knees_at(0.0), 4).route
+    assert (route.changes, route.failures[0].status) == ((), Status.BUDGET)
     there = Scripted(lambda key, _: None)
-    assert follow([there], knees_at(1.0), 9, quiet).route.arrived
+    assert follow([there], knees_at(1.0), 9).route.arrived
 
 
 def test_a_secondary_policy_is_followed_where_the_first_has_no_stable_step():
     stuck = Failure(status=Status.STUCK, detail="stuck")
     first = Scripted(lambda key, k: knees_at(0.1) if k == 1 else stuck)
     other = Scripted(lambda key, k: knees_at(0.2) if k == 1 else stuck)
-    found = follow([first, other], knees_at(0.0), 9, quiet)
+    found = follow([first, other], knees_at(0.0), 9)
     # The first is asked first again after each.
     assert (first.asked, other.asked) == (3, 2)
     assert [i.option for i in found.iterations] == ["ac3", "ac3, secondary 1"]
@@ -132,8 +133,8 @@ def test_policies_that_do_not_know_how_to_go_on_on_top_are_not_followed():
     lost = replace(POLICY, options=POLICY.options[-1:])
     other = replace(POLICY, reach={"LKnee": 0.1})
     policy = replace(POLICY, secondary=(lost, other))
-    ik = IK(build_world(ROBOT, table()))
-    assert [f.gait.policy for f in followers_of(ik, policy, OPTIONS)] == [policy, other]
+    search = Search(IK(build_world(ROBOT, table())), OPTIONS)
+    assert [f.gait.policy for f in followers_of(search, policy)] == [policy, other]
 
 
 # With the robot.
@@ -154,8 +155,10 @@ def climbing():
     """The first contacts of a flight of 0.25 m treads."""
     ik = IK(build_world(ROBOT, stairs(3, 0.15, 0.25)))
     start = standing(ik, OPTIONS.keyframe)
-    found = follow(followers_of(ik, POLICY, OPTIONS), start, 8, quiet)
+    search = Search(ik, OPTIONS)
+    found = follow(followers_of(search, POLICY), start, 8)
     assert not found.route.failures
+    assert {a.proposer for a in search.attempts} == {"gait"}
     return ik, found.route
 
 
@@ -261,7 +264,7 @@ def followed_from(ik: IK, q: np.ndarray, stance: tuple[Contact, ...], changes: i
     """From a posture that is stable on some contacts."""
     task = KeyframeTask(held=stance, new=(), q_reference=q)
     key = direct(ik, task, q, OPTIONS.keyframe)
-    found = follow(followers_of(ik, POLICY, OPTIONS), key, changes, quiet)
+    found = follow(followers_of(Search(ik, OPTIONS), POLICY), key, changes)
     assert not found.route.failures
     return found.route
 

@@ -299,12 +299,12 @@ class _Task:
     def _followed(self, policy: GeneralPolicy) -> Plan:
         """A policy from the stance that the robot is in."""
         options, search = self._options, self._search
-        followers = followers_of(self._ik, policy, options)
+        followers = followers_of(search, policy)
         if self._from_standing:
             followers[0].gait.check_route()
         most, ahead = options.max_changes, search.budget.ahead
         most = 0 if self._unsettled else most if ahead is None else ahead
-        found = follow(followers, self._start, most, search.report)
+        found = follow(followers, self._start, most)
         stances = tuple(Stance(contacts=k.stance) for k in found.route.keyframes)
         sequence = ContactSequence(
             source="; ".join(policy.sources) or "a policy",

@@ -15,11 +15,12 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.contact.policy import GeneralPolicy, pelvis_rotation
 from clamber.contact.steps import Step
+from clamber.errors import Status
 from clamber.model.records import short_repr
 from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
-from clamber.planning.demonstrated import search_steps
+from clamber.planning.demonstrated import follow_steps
 from clamber.planning.gait import Gait
 from clamber.planning.proposals import (
     Climb,
@@ -31,15 +32,10 @@ from clamber.planning.proposals import (
     pursue,
     stuck,
 )
-from clamber.planning.records import (
-    Fallback,
-    Iteration,
-    PlanOptions,
-    Progress,
-    Route,
-)
+from clamber.planning.records import Fallback, Iteration, Route
 from clamber.planning.route import Frame, contact_at
-from clamber.step.change import Change, Failure, change_contact, home_at, standing
+from clamber.planning.search import Search
+from clamber.step.change import Change, Failure, home_at, standing
 from clamber.step.ik import IK, PostureProblem, contact_clearance
 from clamber.step.posture import CLEARANCE, Keyframe
 from clamber.step.tasks import closed
@@ -78,14 +74,14 @@ class Follower:
     """A gait whose proposals are tried.
 
     Attributes:
+        search: What tries.
         gait: What proposes.
-        options: Of the plan.
     """
 
-    def __init__(self, ik: IK, gait: Gait, options: PlanOptions) -> None:
+    def __init__(self, search: Search, gait: Gait) -> None:
         """Look at the robot on all fours once."""
-        self.gait, self.options = gait, options
-        self._ik, self._quadrupedal = ik, quadrupedal_posture(ik, gait)
+        self.search, self.gait = search, gait
+        self._quadrupedal = quadrupedal_posture(search.ik, gait)
 
     def next_changes(self, key: Keyframe) -> tuple[Made, Failure | None]:
         """What is done next, and why nothing; neither where it has arrived."""
@@ -100,8 +96,9 @@ class Follower:
         """All steps of a climb, or none."""
         start, steps = climb.after.key, [step for step, _ in climb.steps]
         if climb.start is not None:
-            start = standing(self._ik, self.options.keyframe, climb.start)
-        route, _ = search_steps(self._ik, start, steps, self.options)
+            options = self.search.options.keyframe
+            start = standing(self.search.ik, options, climb.start)
+        route, _ = follow_steps(self.search, start, steps, "gait")
         failure = next(iter(route.failures), None)
         if not steps:
             failure = stuck("nothing is left to climb with")
@@ -132,7 +129,7 @@ class Follower:
         self, key: Keyframe, goal: Goal, proposal: Proposal, how: Round
     ) -> Change | Failure | None:
         """The first contact of a goal that can be made, or why not the last."""
-        found, world = None, self._ik.world
+        found, ik, world = None, self.search.ik, self.search.ik.world
         limb = world.robot.limb_of(goal.contacts[0].surface)
         breaks = tuple(c.surface for c in key.stance if c.surface in limb.surfaces)
         pelvis = self.gait.pelvis(key, proposal.body) if how.pelvis else None
@@ -141,7 +138,7 @@ class Follower:
             reference = home_at(world, self.gait.ankles(proposal.body))
         for contact in goal.contacts[: 1 if how.first else None]:
             if proposal.posture == "upright":
-                reference = upright_posture(self._ik, key, contact)
+                reference = upright_posture(ik, key, contact)
             step = Step(
                 limb=limb.name,
                 breaks=breaks,
@@ -150,28 +147,26 @@ class Follower:
                 base_rotation=pelvis,
                 reference=reference,
             )
-            keyframe, method = self.options.keyframe, self.options.method
-            found = change_contact(self._ik, key, step, keyframe, method)
+            found = self.search.change("gait", key, step)
             if isinstance(found, Change):
                 return found
         return found
 
 
-def followers_of(ik: IK, policy: GeneralPolicy, options: PlanOptions) -> list[Follower]:
+def followers_of(search: Search, policy: GeneralPolicy) -> list[Follower]:
     """Of a policy, and of its secondary ones that know how to go on on top."""
     others = [p for p in policy.secondary if any(o.region == "O" for o in p.options)]
-    return [Follower(ik, Gait(ik.world, p), options) for p in (policy, *others)]
+    world = search.ik.world
+    return [Follower(search, Gait(world, p)) for p in (policy, *others)]
 
 
-def follow(
-    followers: Sequence[Follower], start: Keyframe, most: int, report: Progress
-) -> Followed:
+def follow(followers: Sequence[Follower], start: Keyframe, most: int) -> Followed:
     """Go on from a keyframe, by so many contact changes at most.
 
     Where the first of the followers has no stable step, the others are asked; then the
     first is asked again.
     """
-    goal, limit = followers[0].gait.goal, followers[0].options.max_changes
+    goal, search = followers[0].gait.goal, followers[0].search
     changes: list[Change] = []
     iterations: list[Iteration] = []
     others: list[str] = []
@@ -192,8 +187,11 @@ def follow(
             why = f"it only goes to and fro, {to_go:.2f} m from the goal"
             failure = stuck(why)
             break
+        if search.late:
+            failure = Failure(status=Status.BUDGET)
+            break
         note = f"{to_go:.2f} m to go, {len(changes)} contact changes"
-        report("plan", 1.0 - min(to_go / max(first, 1e-9), 1.0), note)
+        search.report("plan", 1.0 - min(to_go / max(first, 1e-9), 1.0), note)
         made, failure = followers[0].next_changes(key)
         arrived = not made and failure is None
         name = ""
@@ -210,6 +208,7 @@ def follow(
             cost = cost_to_go(change.keyframe.stance, goal)
             label = f"{option}, {name}" if name else option
             iterations.append(Iteration(option=label, cost=cost))
+    limit = search.options.max_changes
     if not arrived and failure is None and len(changes) >= limit:
         failure = stuck(f"{limit} contact changes were not enough")
     route = Route(
