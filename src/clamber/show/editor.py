@@ -131,7 +131,12 @@ def plan_edited(
     """
     sequence, world = edited_sequence(plan, moved, off), plan.world
     return planner.plan(
-        sequence, world.robot, world.scene, options=plan.options, progress=progress
+        sequence,
+        world.robot,
+        world.scene,
+        options=plan.options,
+        contacts="demonstrated",
+        progress=progress,
     )
 
 
