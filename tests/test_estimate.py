@@ -8,11 +8,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from clamber.contact.steps import MOVED
 from clamber.execution.estimate import (
     FORCE_SMOOTHING,
     LOST,
     NEAR,
-    SAME_PLACE,
     TOUCH,
     Estimate,
 )
@@ -201,12 +201,12 @@ def test_measured_places_make_the_scene_and_are_renewed(estimate, hands_plan):
     assert top() == pytest.approx(0.03, abs=3e-3)
     # Again near there takes its place; farther off is another place.
     q = estimate.q.copy()
-    q[:3] += [0.9 * SAME_PLACE, 0.0, 0.03]
+    q[:3] += [0.9 * MOVED.measured, 0.0, 0.03]
     settle(estimate, q)
     estimate.remember([c], 1)
     assert top() == pytest.approx(0.0, abs=1e-3)
     assert estimate.scene(planned).boxes[0].roughness == pytest.approx(0.02)
-    q[:3] += [1.1 * SAME_PLACE, 0.0, -0.03]
+    q[:3] += [1.1 * MOVED.measured, 0.0, -0.03]
     settle(estimate, q)
     estimate.remember([c], 1)
     assert estimate.scene(planned).boxes[0].roughness > 0.02

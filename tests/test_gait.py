@@ -12,6 +12,7 @@ import pytest
 
 from clamber.contact.contact import Contact
 from clamber.contact.policy import GeneralPolicy, Option, PelvisDistribution
+from clamber.contact.steps import MOVED
 from clamber.errors import InputError, Status
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Box, Scene
@@ -19,7 +20,7 @@ from clamber.model.world import build_world
 from clamber.planning.gait import BEFORE_RISER, RISER_SHARES, SHARES, Gait
 from clamber.planning.gaps import due_near_gap, gaps_ahead
 from clamber.planning.proposals import FREELY, Climb, Outcome, Proposal, pursue
-from clamber.planning.route import SAME, Frame
+from clamber.planning.route import Frame
 from clamber.step.change import Failure
 from conftest import stairs
 
@@ -379,7 +380,7 @@ def test_a_limb_that_lost_its_contact_is_set_down_first(wide):
         frame = wide.quadrupedal_frame(kept)
         offset = wide.proportions.offsets[wide.world.robot.limb_of(surface).name]
         np.testing.assert_allclose(frame.local(belongs.position), offset, atol=1e-9)
-        assert np.linalg.norm(here.position - belongs.position) > SAME
+        assert np.linalg.norm(here.position - belongs.position) > MOVED.wanted
         ((change, _),), _ = Obstinate(wide, kept, lambda c: False).pursue()
         assert {c.surface for c in change.stance} == {c.surface for c in stance}
 
@@ -509,12 +510,12 @@ def test_arms_wait_at_a_gap_until_the_legs_are_near_enough(gap):
     stretched = 2.0 * gap.proportions.stretch
     walks, hops = due(gap, 0.80, 0.40)
     assert (set(walks), hops) == (LEGS, {})  # elbows are at the border already
-    assert max(walks.values()) <= 0.40 + gap.proportions.step["left_leg"] + SAME
+    assert max(walks.values()) <= 0.40 + gap.proportions.step["left_leg"] + MOVED.wanted
     walks, hops = due(gap, 0.80, 0.98 - stretched + 0.01)
     assert set(hops) == ARMS
     assert all(1.15 <= x <= 1.17 for x in hops.values())
     # Knees any nearer to the elbows could not let go of them.
-    assert all(x <= 0.98 - stretched + 2.0 * SAME for x in walks.values())
+    assert all(x <= 0.98 - stretched + 2.0 * MOVED.wanted for x in walks.values())
 
 
 def test_legs_step_across_together_once_the_arms_are_far_enough(gap):

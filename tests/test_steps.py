@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clamber.contact.contact import Contact, ContactSequence, Stance
-from clamber.contact.steps import SAME_PLACE, split_steps
+from clamber.contact.steps import MOVED, split_steps
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World, build_world
@@ -183,10 +183,11 @@ def test_a_stance_that_is_no_keyframe_is_skipped_and_says_why(world):
 
 
 @pytest.mark.parametrize(
-    ("dx", "moved"), [(0.0, False), (0.9 * SAME_PLACE, False), (1.1 * SAME_PLACE, True)]
+    ("dx", "moved"),
+    [(0.0, False), (0.9 * MOVED.shown, False), (1.1 * MOVED.shown, True)],
 )
 def test_a_contact_made_again_in_the_same_place_has_not_moved(world, dx, moved):
-    assert SAME_PLACE == 0.03
+    assert MOVED.shown == 0.03
     again = [contact("LFoot"), contact("RFoot"), contact("LHand", dx)]
     found = moves(
         world, "LFoot RFoot", "LFoot RFoot LHand", "LFoot RFoot", again, "LFoot LHand"
@@ -223,7 +224,7 @@ def test_moves_done_in_order_lead_from_stance_to_stance(world, seed):
     last = {c.surface: c for c in demo.stances[-1].contacts}
     assert set(down) == set(last)
     for name, c in last.items():
-        assert np.linalg.norm(c.position - down[name].position) < SAME_PLACE
+        assert np.linalg.norm(c.position - down[name].position) < MOVED.shown
 
 
 @pytest.mark.parametrize(

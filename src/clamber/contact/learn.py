@@ -33,7 +33,7 @@ from clamber.contact.policy import (
     climbed_edges,
     pelvis_angles,
 )
-from clamber.contact.steps import SAME_PLACE
+from clamber.contact.steps import MOVED
 from clamber.errors import InputError
 from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat, wrap
@@ -136,7 +136,7 @@ def _acting(
         c.surface: _moved(c, last.get(_limb(c.surface), {}).get(c.surface))
         for c in stance.contacts
     }
-    far = {n: d for n, d in moved.items() if d > SAME_PLACE}
+    far = {n: d for n, d in moved.items() if d > MOVED.shown}
     new = [n for n in far if previous.contact(n) is None]
     if new:
         return new
@@ -469,7 +469,7 @@ def _reach(demos: Sequence[DemoPolicy], surfaces: set[str]) -> dict[str, float]:
             if was is None or was.surface != now.surface or now.surface not in surfaces:
                 continue
             step = _moved(now, was)
-            if SAME_PLACE < step < math.inf:
+            if MOVED.shown < step < math.inf:
                 length = sum(demo.subject[x] for x in _SEGMENTS[limb.split("_")[1]])
                 out[now.surface] = max(out.get(now.surface, 0.0), step / length)
     return {n: out[n] for n in PARTS if n in out}

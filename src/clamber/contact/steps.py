@@ -12,7 +12,31 @@ from clamber.model.records import short_repr
 from clamber.model.world import World
 
 NOT_SHOWN = Stance(contacts=())  # of a step that no demonstration shows
-SAME_PLACE = 0.03  # [m] a contact made again nearer than this has not moved
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepTolerances:
+    """How near to where it was a contact has not moved [m], by who asks.
+
+    Larger: fewer steps; too large: steps that matter are missed. Too small: a shuffle
+    counts as a step.
+
+    Attributes:
+        shown: Of a demonstration: as far as a foot shuffles.
+        searched: Of a search for contacts, which shall try what differs.
+        wanted: Of a policy.
+        measured: Of execution; a touch this near replaces what was measured there.
+        eased: Of contacts that are planned elsewhere for a later one's sake.
+    """
+
+    shown: float = 0.03
+    searched: float = 0.08
+    wanted: float = 0.02
+    measured: float = 0.05
+    eased: float = 0.005
+
+
+MOVED = StepTolerances()
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -161,8 +185,8 @@ def on_feet(world: World, stance: Sequence[Contact]) -> bool:
 
 
 def same_place(a: Contact, b: Contact) -> bool:
-    """Whether a surface is where it was, within `SAME_PLACE`."""
-    near = float(np.linalg.norm(a.position - b.position)) < SAME_PLACE
+    """Whether a surface is where it was, within what a demonstration shows."""
+    near = float(np.linalg.norm(a.position - b.position)) < MOVED.shown
     return a.surface == b.surface and a.support == b.support and near
 
 

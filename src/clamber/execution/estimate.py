@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.contact.steps import MOVED
 from clamber.execution.probe import REACH
 from clamber.execution.sensors import Measurement
 from clamber.execution.terrain import believed_scene
@@ -28,7 +29,6 @@ FORCE_SMOOTHING = 0.03  # [s] time constant of the forces
 POSE_SMOOTHING = 0.01  # [s] ... and of the measured posture: it must not lag a touch
 TILTED = 0.35  # [rad] a sole that is more so touches with a corner
 NEAR = 0.06  # [m] sideways from the planned place, a touch is that contact
-SAME_PLACE = 0.05  # [m] a surface that lands again this near replaces what was measured
 
 
 class Estimate:
@@ -138,7 +138,8 @@ class Estimate:
                 near = (
                     k
                     for k, (_, x) in self._measured.items()
-                    if k[0] == c.surface and np.linalg.norm(x[:2] - p[:2]) < SAME_PLACE
+                    if k[0] == c.surface
+                    and np.linalg.norm(x[:2] - p[:2]) < MOVED.measured
                 )
                 key = next(near, (c.surface, done))
                 self._measured[key] = (c.support, p)

@@ -24,7 +24,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence, Region, Stance, region_of
 from clamber.contact.policy import GeneralPolicy
-from clamber.contact.steps import Step, on_feet, split_steps
+from clamber.contact.steps import MOVED, Step, on_feet, split_steps
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
@@ -37,7 +37,6 @@ from clamber.step.stability import STANDING_SHARE, standing_share
 
 Counts = Mapping[tuple[Region, str], float]
 
-SAME_PLACE = 0.08  # [m] a surface that comes down nearer to where it was has not moved
 INSET = 0.05  # [m] of a place from the border of its support
 TRUNK_GIVE = 1.1  # a bent waist: longest over present distance of shoulders and hips
 FAR = 0.25  # of what a limb has left: each length of it that it is away
@@ -385,4 +384,4 @@ def _apart(a: Contact, b: Contact) -> float:
 
 def _same(a: Contact, b: Contact) -> bool:
     at = (a.surface, a.support) == (b.surface, b.support)
-    return at and _apart(a, b) < SAME_PLACE
+    return at and _apart(a, b) < MOVED.searched

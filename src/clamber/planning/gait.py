@@ -29,7 +29,7 @@ from clamber.contact.policy import (
     pelvis_distribution,
     pelvis_rotation,
 )
-from clamber.contact.steps import Seeds, Step
+from clamber.contact.steps import MOVED, Seeds, Step
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Edge
@@ -54,7 +54,6 @@ from clamber.planning.proposals import (
 from clamber.planning.route import (
     ARRIVED,
     FACING,
-    SAME,
     Frame,
     Platform,
     contact_at,
@@ -637,7 +636,7 @@ def _others_first(surfaces: Sequence[str]) -> tuple[str, ...]:
 
 
 def _is_same(here: Contact, there: Contact) -> bool:
-    return bool(np.linalg.norm(there.position - here.position) < SAME)
+    return bool(np.linalg.norm(there.position - here.position) < MOVED.wanted)
 
 
 def reversed_steps(changes: Made, home: np.ndarray) -> list[tuple[Step, str]]:

@@ -13,8 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.contact.steps import MOVED
 from clamber.planning.proportions import Proportions
-from clamber.planning.route import SAME, Frame, Platform
+from clamber.planning.route import Frame, Platform
 
 
 def gaps_ahead(
@@ -75,17 +76,17 @@ def due_near_gap(
     hops: dict[str, float] = {}
     last = math.inf
     while x < min(length, last):
-        x += SAME
+        x += MOVED.wanted
         for n in on:
             to = stretched(n, x)
-            if float((to.position[:2] - frame.xy) @ way) - at[n] <= SAME:
+            if float((to.position[:2] - frame.xy) @ way) - at[n] <= MOVED.wanted:
                 continue
             if to.support != on[n].support:
                 hops.setdefault(n, x)
             elif n not in hops:
                 walks.setdefault(n, x)
             # Where the first is due, it is that far ahead already.
-            last = min(last, x + step - 2.0 * SAME)
+            last = min(last, x + step - 2.0 * MOVED.wanted)
     if hops:  # those of the first that is due, both arms or both legs
         x, first = min((d, n) for n, d in hops.items())
         arms = first.endswith("arm")

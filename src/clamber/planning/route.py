@@ -22,7 +22,6 @@ from clamber.model.se3 import quat_from_matrix, turn_about_z
 GAP = 0.40  # [m] a narrower gap is crossed on top, a wider one on the ground
 JOINT = 0.02  # [m] a narrower gap is none
 BESIDE = 0.25  # [m] an edge is climbed so far from its ends, where it is that long
-SAME = 0.02  # [m] a contact wanted nearer to where it is does not move
 ARRIVED = 0.05  # [m] from where it shall get to, the body is there
 FACING = 0.15  # [rad] from how it shall face
 BORDER = 0.02  # [m] contacts stay so far inside a top's border

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clamber.contact.contact import Contact
-from clamber.contact.steps import Seeds, Step
+from clamber.contact.steps import MOVED, Seeds, Step
 from clamber.errors import Status
 from clamber.model.records import short_repr
 from clamber.model.world import World
@@ -34,7 +34,6 @@ MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the
 # that can be kept
 ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
 LEAN_WEIGHT = 0.5  # soft task (4.27)
-MOVED = 0.005  # [m] a contact that lies nearer to where it was has not moved
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
 
 
@@ -313,7 +312,7 @@ def eased_contacts(
         ik.kin.update(solution.q)
         eased = tuple(_touching_at(ik, c) for c in moved)
         if any(
-            np.linalg.norm(a.position - b.position) > MOVED
+            np.linalg.norm(a.position - b.position) > MOVED.eased
             for a, b in zip(eased, moved, strict=True)
         ):
             return eased, Seeds(**{posture: solution.q})
