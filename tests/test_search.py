@@ -228,111 +228,119 @@ def fake_steps(*names: tuple[str, int]) -> list[Step]:
     return [Step(limb=n, breaks=(), makes=contact, stance=i) for n, i in names]
 
 
-def test_after_a_repair_planning_goes_on_from_the_mended_step(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].makes
-    fake = FakePlanner(
-        monkeypatch,
-        lambda name, tried: name == "c" and "a!" not in tried,
-        lambda limb, paths: ({0: contact}, Seeds()),
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
-    assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
-    assert found.keyframes[1:] == ("a!", "b", "c", "d")
-    assert found.arrived
+A = {0: fake_steps(("a", 1))[0].makes}  # the first change's contact elsewhere
 
 
-def test_repairs_end_after_a_few_and_the_step_is_then_skipped(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].makes
-    fake = FakePlanner(
-        monkeypatch,
-        lambda name, tried: name == "b",
-        lambda limb, paths: ({0: contact}, Seeds()),
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
-    assert fake.tried.count("b") == demonstrated.MAX_REPAIRS + 1
-    assert [str(f) for f in found.failures] == ["b"]
-    assert found.keyframes[1:] == ("a!", "c")
-
-
-def test_a_skipped_step_between_does_not_confuse_which_step_is_mended(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].makes
-    fake = FakePlanner(
-        monkeypatch,
-        lambda name, tried: name == "a" or (name == "c" and "b!" not in tried),
-        lambda limb, paths: None if limb == "a" else ({0: contact}, Seeds()),
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
-    assert fake.tried == ["a", "b", "c", "b!", "c"]
-    assert [str(f) for f in found.failures] == ["a"]
-    assert found.keyframes[1:] == ("b!", "c")
-
-
-def test_a_step_skipped_before_and_after_a_repair_is_reported_once(ik, monkeypatch):
-    """Both steps belong to one stance: the second one is tried, and missed, again."""
-    contact = fake_steps(("a", 1))[0].makes
-    FakePlanner(
-        monkeypatch,
-        lambda name, tried: name == "b" or (name == "c" and "a!" not in tried),
-        lambda limb, paths: None if limb == "b" else ({0: contact}, Seeds()),
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 1), ("c", 2)))
-    assert [str(f) for f in found.failures] == ["b"]
-
-
-def test_a_step_that_works_after_a_repair_is_no_longer_missed(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].makes
-    FakePlanner(
-        monkeypatch,
-        lambda name, tried: name in "bc" and "a!" not in tried,
-        lambda limb, paths: None if limb == "b" else ({0: contact}, Seeds()),
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
-    assert found.keyframes[1:] == ("a!", "b", "c")
-    assert found.arrived
-
-
-def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(ik, monkeypatch):
-    contact = fake_steps(("a", 1))[0].makes
-    fake = FakePlanner(
-        monkeypatch,
-        lambda name, tried: False,
-        lambda limb, paths: ({0: contact}, Seeds()),
-        lambda name, tried: MARGINS[name == "c" and "a!" not in tried],
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
-    assert fake.asked == MARGINS[0]
-    assert fake.tried == ["a", "b", "c", "a!", "b", "c", "d"]
-    assert found.keyframes[1:] == ("a!", "b", "c", "d")
-    assert [c.margin for c in found.changes] == [MARGINS[0]] * 4
-
-
-@pytest.mark.parametrize("worse", ["a!", "b"])
-def test_no_step_loses_its_margin_to_another_one(ik, monkeypatch, worse):
-    contact = fake_steps(("a", 1))[0].makes
-    FakePlanner(
-        monkeypatch,
-        lambda name, tried: False,
-        lambda limb, paths: ({0: contact}, Seeds()),
-        lambda name, tried: MARGINS[name == worse if "a!" in tried else name == "c"],
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
-    assert found.keyframes[1:] == ("a", "b", "c")
-    assert [c.margin for c in found.changes] == [*MARGINS[:1] * 2, MARGINS[-1]]
-
-
-def test_a_step_with_a_small_margin_counts_where_others_would_be_missed(
-    ik, monkeypatch
+@pytest.mark.parametrize(
+    ("names", "fails", "mended", "tried", "made", "missed"),
+    [
+        # Planning goes on from the mended step, and what works then is not missed.
+        (
+            "abcd",
+            lambda name, tried: name == "c" and "a!" not in tried,
+            "c",
+            ["a", "b", "c", "a!", "b", "c", "d"],
+            ["a!", "b", "c", "d"],
+            [],
+        ),
+        (
+            "abc",
+            lambda name, tried: name in "bc" and "a!" not in tried,
+            "c",
+            ["a", "b", "c", "a!", "b", "c"],
+            ["a!", "b", "c"],
+            [],
+        ),
+        # A step that was left out between does not confuse which one is mended.
+        (
+            "abc",
+            lambda name, tried: name == "a" or (name == "c" and "b!" not in tried),
+            "c",
+            ["a", "b", "c", "b!", "c"],
+            ["b!", "c"],
+            ["a"],
+        ),
+        # One that is missed before and after a repair is reported once.
+        (
+            "abc",
+            lambda name, tried: name == "b" or (name == "c" and "a!" not in tried),
+            "c",
+            ["a", "b", "c", "a!", "b", "c"],
+            ["a!", "c"],
+            ["b"],
+        ),
+        # Repairs end after a few, and the step is then left out.
+        (
+            "abc",
+            lambda name, tried: name == "b",
+            "b",
+            ["a", "b", *["a!", "b"] * demonstrated.MAX_REPAIRS, "c"],
+            ["a!", "c"],
+            ["b"],
+        ),
+    ],
+)
+def test_a_step_that_fails_is_mended_further_back_or_left_out(
+    ik, monkeypatch, names, fails, mended, tried, made, missed
 ):
-    contact = fake_steps(("a", 1))[0].makes
-    FakePlanner(
-        monkeypatch,
-        lambda name, tried: name == "b" and "a!" in tried,
-        lambda limb, paths: ({0: contact}, Seeds()) if paths else None,
-        lambda name, tried: MARGINS[name == "c"],
-    )
-    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3)))
+    def repairs_to(limb, changes):
+        return (A, Seeds()) if limb == mended else None
+
+    fake = FakePlanner(monkeypatch, fails, repairs_to)
+    found = find(ik, fake_steps(*((n, i) for i, n in enumerate(names))))
+    assert fake.tried == tried
+    assert list(found.keyframes[1:]) == made
+    assert [str(f) for f in found.failures] == missed
+    assert found.arrived is (missed == [])
+
+
+WIDE, NARROW = MARGINS[0], MARGINS[-1]
+
+
+@pytest.mark.parametrize(
+    ("fails", "margin", "made", "margins"),
+    [
+        # Room is made for a step with a small margin.
+        (
+            lambda name, tried: False,
+            lambda name, tried: MARGINS[name == "c" and "a!" not in tried],
+            ["a!", "b", "c", "d"],
+            [WIDE] * 4,
+        ),
+        # But no other step loses its margin for it,
+        (
+            lambda name, tried: False,
+            lambda name, tried: MARGINS[name == "a!" if "a!" in tried else name == "c"],
+            ["a", "b", "c", "d"],
+            [WIDE, WIDE, NARROW, WIDE],
+        ),
+        (
+            lambda name, tried: False,
+            lambda name, tried: MARGINS[name == "b" if "a!" in tried else name == "c"],
+            ["a", "b", "c", "d"],
+            [WIDE, WIDE, NARROW, WIDE],
+        ),
+        # and none is missed for it.
+        (
+            lambda name, tried: name == "b" and "a!" in tried and "d" not in tried,
+            lambda name, tried: MARGINS[name == "c"],
+            ["a", "b", "c", "d"],
+            [WIDE, WIDE, NARROW, WIDE],
+        ),
+    ],
+)
+def test_for_a_larger_margin_earlier_contacts_are_put_elsewhere(
+    ik, monkeypatch, fails, margin, made, margins
+):
+    def repairs_to(limb, changes):
+        return (A, Seeds()) if limb == "c" else None
+
+    fake = FakePlanner(monkeypatch, fails, repairs_to, margin)
+    found = find(ik, fake_steps(("a", 1), ("b", 2), ("c", 3), ("d", 4)))
+    assert fake.asked == WIDE
+    assert list(found.keyframes[1:]) == made
+    assert [c.margin for c in found.changes] == margins
     assert found.arrived
-    assert found.keyframes[1:] == ("a", "b", "c")
 
 
 def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkeypatch):

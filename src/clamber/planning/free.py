@@ -274,7 +274,8 @@ class _Guidance:
                 continue
             lengths = 1.0
             if c is not None:
-                away = c.position - self._nearest(goal, c.position)
+                top = self._world.supports[goal]
+                away = c.position - top.nearest(c.position, INSET)
                 length = max(self._length[s] for s in limb.surfaces)
                 lengths = float(np.linalg.norm(away)) / length
             total += 1.0 + FAR * lengths
@@ -329,18 +330,11 @@ class _Guidance:
         below = Contact(
             surface=surface,
             support=support,
-            position=self._nearest(support, root),
+            position=self._world.supports[support].nearest(root, INSET),
             quaternion=self._turns[support],
         )
         known = self._places.get((surface, support), [])
         return [*known, *([below] if all(not _same(below, k) for k in known) else [])]
-
-    def _nearest(self, support: str, p: np.ndarray) -> np.ndarray:
-        """The nearest place (3,) on a support, `INSET` from its border."""
-        s = self._world.supports[support]
-        half = np.maximum(s.polygon.max(axis=0) - INSET, 0.0)
-        local = s.rotation.T @ (p - s.position)
-        return s.position + s.rotation @ np.array([*np.clip(local[:2], -half, half), 0])
 
     def _aimed(self, key: Keyframe, step: Step) -> Step:
         """With the demonstrated stance most like the one it leads to."""
