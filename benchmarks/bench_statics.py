@@ -15,16 +15,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from clamber.step.polygon import (
+    com_margin,
+    polygon_halfplanes,
+    support_ellipse,
+    support_polygon,
+)
 from clamber.step.statics import (
     ContactPoints,
     Load,
-    com_margin,
     contact_forces,
     is_statically_stable,
-    polygon_halfplanes,
     static_equilibrium,
-    support_ellipse,
-    support_polygon,
 )
 
 STANCES = 1000

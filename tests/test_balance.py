@@ -12,7 +12,7 @@ from clamber.execution.balance import FADE, HIGH, MOST, SAG, SMOOTHING, Balance
 from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning.records import Plan
-from clamber.step.statics import com_margin, support_polygon
+from clamber.step.polygon import com_margin, support_polygon
 
 PERIOD = 0.01
 UP = np.array([0.0, 0.0, 1.0])

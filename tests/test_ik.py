@@ -30,7 +30,7 @@ from clamber.step.ik import (
     PostureProblem,
     contact_clearance,
 )
-from clamber.step.statics import support_ellipse, support_polygon
+from clamber.step.polygon import support_ellipse, support_polygon
 from clamber.step.tasks import (
     EDGE_INSET,
     EDGE_ROOM,

@@ -23,9 +23,9 @@ from clamber.step.path import (
     overlap,
     plan_path,
 )
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import CLEARANCE
 from clamber.step.stability import contact_drift, contact_points
-from clamber.step.statics import com_margin, support_polygon
 from clamber.step.transition import plan_transition
 
 

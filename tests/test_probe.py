@@ -19,8 +19,8 @@ from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import World, build_world
 from clamber.planning.trajectory import RATE, holding_torque
 from clamber.step.ik import IK
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.stability import contact_drift, contact_points
-from clamber.step.statics import com_margin, support_polygon
 
 STEPS = range(6)
 

@@ -23,14 +23,9 @@ from clamber.planning.trajectory import (
     point_prices,
     zero_moment_point,
 )
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.stability import contact_points, point_jacobians
-from clamber.step.statics import (
-    Load,
-    com_margin,
-    cone_generators,
-    contact_forces,
-    support_polygon,
-)
+from clamber.step.statics import Load, cone_generators, contact_forces
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.se3 import matrix_from_rpy
 from clamber.step.ik import IK
+from clamber.step.polygon import com_margin, support_ellipse, support_polygon
 from clamber.step.stability import contact_drift, contact_points, equilibrium_at
-from clamber.step.statics import com_margin, support_ellipse, support_polygon
 from clamber.step.transition import (
     MARGINS,
     REACH_ANGLE,

@@ -21,8 +21,8 @@ from clamber.model.kinematics import Kinematics
 from clamber.run.figures import finish_axes, save_plot
 from clamber.show.pictures import mark_keyframe
 from clamber.show.renderer import Camera, view_of
+from clamber.step.polygon import support_ellipse, support_polygon
 from clamber.step.posture import STABILITY_WEIGHT
-from clamber.step.statics import support_ellipse, support_polygon
 
 mpl.rcParams.update({"font.size": 9, "axes.titlesize": 9, "savefig.dpi": 110})
 

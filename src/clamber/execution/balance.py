@@ -24,7 +24,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
-from clamber.step.statics import com_margin, support_polygon
+from clamber.step.polygon import com_margin, support_polygon
 
 HIGH, FADE = 0.022, 0.008  # [m] margin at which feedback sets in, and within how much
 SAG = 0.003  # [m] less than the planned margin is no danger

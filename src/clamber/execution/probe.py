@@ -12,8 +12,8 @@ from clamber.model.world import World, limb_links
 from clamber.planning.trajectory import Trajectory, build_trajectory
 from clamber.step.ik import IK
 from clamber.step.path import ARC_WEIGHT, Phase
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.stability import contact_points
-from clamber.step.statics import com_margin, support_polygon
 from clamber.step.tasks import reaching
 from clamber.step.transition import balance_problem
 

@@ -21,8 +21,9 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
+from clamber.step.polygon import support_polygon
 from clamber.step.stability import EFFORT_SHARE, contact_points, point_jacobians
-from clamber.step.statics import cone_generators, support_polygon
+from clamber.step.statics import cone_generators
 
 JOINT_SPEED = 4.0  # [rad/s] of a joint whose description has no lower limit
 # [rad/s^2] of a joint: what servos of 600 N m/rad and 50 N m follow within 0.02 rad on

@@ -28,14 +28,9 @@ from clamber.model.world import World
 from clamber.planning.timing import GRID, demand_at, least_torques, retime
 from clamber.step.change import Change
 from clamber.step.path import Phase
+from clamber.step.polygon import com_margins, support_polygon
 from clamber.step.stability import contact_points, torque_limits
-from clamber.step.statics import (
-    GRAVITY,
-    Load,
-    com_margins,
-    contact_forces,
-    support_polygon,
-)
+from clamber.step.statics import GRAVITY, Load, contact_forces
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases

@@ -41,15 +41,10 @@ from clamber.run.folder import (
     load_plan,
     load_rollout,
 )
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import Keyframe
 from clamber.step.stability import contact_points
-from clamber.step.statics import (
-    Phase,
-    com_margin,
-    projected_distance,
-    support_polygon,
-    theta_max,
-)
+from clamber.step.statics import Phase, projected_distance, theta_max
 
 SAMPLES_A_SECOND = 25
 SAME_POSTURE = 1e-3  # [rad]

@@ -31,7 +31,7 @@ from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
-from clamber.step.statics import com_margin, support_polygon
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.tasks import (
     FAR,
     Apart,

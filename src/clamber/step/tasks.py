@@ -23,11 +23,7 @@ from clamber.model.records import short_repr
 from clamber.model.scene import Support
 from clamber.model.se3 import frame_from_normal, matrix_from_quat, rotation_vector
 from clamber.model.world import Surface, World
-from clamber.step.statics import (
-    polygon_halfplanes,
-    support_ellipse,
-    support_polygon,
-)
+from clamber.step.polygon import polygon_halfplanes, support_ellipse, support_polygon
 
 FLAT_WEIGHT = 0.3  # of a flat surface's turn, against its place
 EDGE_INSET = 0.015  # [m] contacts stay this far inside the support's border
