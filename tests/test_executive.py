@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError, Status
-from clamber.execution import executive
+from clamber.execution import executive, unintended
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.estimate import LOST, TOUCH
 from clamber.execution.events import (
@@ -29,7 +29,6 @@ from clamber.execution.executive import (
     FALLBACK,
     LOOK,
     MASS_CHANGE,
-    RETREATS,
     SEARCHES,
     START_DRIFT,
     THINKING,
@@ -40,7 +39,7 @@ from clamber.execution.probe import PROBE_SPEED, REACH
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import JointServo, self_positioning_joints
 from clamber.execution.simulation import has_fallen, simulate
-from clamber.execution.unintended import UnintendedContact
+from clamber.execution.unintended import RETREATS, UnintendedContact
 from clamber.execution.verdict import END_SPEED, Figure, judge
 from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_from_yaw, quat_multiply
@@ -586,7 +585,7 @@ def arm_on_box(demo_plan, monkeypatch):
     def loaded_link(kin, load, weight):
         return UnintendedContact(m.geom(geom["name"]).id, "box", 0.01)
 
-    monkeypatch.setattr(executive, "loaded_link", loaded_link)
+    monkeypatch.setattr(unintended, "loaded_link", loaded_link)
     return geom
 
 
@@ -603,7 +602,7 @@ def test_a_limb_on_its_way_may_graze_an_edge(
     assert kinds(told.events) == [Unintended] * (side == "R")
     if side == "R":
         assert told.events[0].support == "box"
-        assert list(told.executive.clearance.values()) == [pytest.approx(0.03)]
+        assert list(told.executive.watch.clearance.values()) == [pytest.approx(0.03)]
 
 
 def test_on_the_way_to_where_a_change_begins_an_unintended_contact_may_end(
@@ -666,7 +665,9 @@ def test_what_is_loaded_in_place_of_a_contact_hits_no_side(
 ):
     """A hand in the stance, or the elbow that has come to lie there instead."""
     asked = []
-    monkeypatch.setattr(executive, "nearest_of", lambda kin, names: asked.append(names))
+    monkeypatch.setattr(
+        unintended, "nearest_of", lambda kin, names: asked.append(names)
+    )
     told, end = Told(demo_plan), end_of(demo_plan, 0)
     told.to(end)
     kin, top = Kinematics(demo_plan.world), demo_plan.world.supports["box"]

@@ -18,9 +18,8 @@ what the joints are to do a `Reference`; between them this module decides.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Generator, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,16 +44,11 @@ from clamber.execution.events import (
     Unintended,
 )
 from clamber.execution.probe import REACH, guarded_move
+from clamber.execution.progress import Progress, Span
 from clamber.execution.reference import Reference, Ticks
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import JointServo, SelfPositioning
-from clamber.execution.unintended import (
-    UnintendedContact,
-    hit_sideways,
-    load_is_missing,
-    loaded_link,
-    nearest_of,
-)
+from clamber.execution.unintended import Watch
 from clamber.model.scene import Scene
 from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, limb_links
@@ -62,7 +56,7 @@ from clamber.planning.planner import plan
 from clamber.planning.records import Budget, Plan, State
 from clamber.planning.trajectory import HOLD_END, HOLD_START, Trajectory
 from clamber.step.change import Failure
-from clamber.step.ik import NO_EXTRA
+from clamber.step.ik import NO_EXTRA, ExtraClearance
 from clamber.step.posture import Keyframe
 
 DEVIATION = 0.006  # [m] along the normal: the rest is planned again
@@ -75,11 +69,8 @@ THINKING = 1.0  # [s] the robot stands still while the rest is planned again
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
-UNINTENDED = 0.1  # [s] a link is loaded for so long where it should not be: it is
 SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for such a load
 LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
-CLEARANCE = 0.02  # [m] farther than where an unintended contact was
-RETREATS = 4  # as often another way is looked for
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
 FIRST = round(HOLD_START / PHYSICS_STEP) - 1  # sample from which a trajectory moves
 
@@ -120,34 +111,6 @@ class OpenLoop:
         return len(self._trajectory.time) - 1 - self._k
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Span:
-    """A contact change of a trajectory, in samples."""
-
-    begin: int  # sample of the keyframe before
-    swing: int  # first sample with the limb in the air
-    touch: int  # last sample before the new contact is closed
-    end: int
-    makes: Contact | None
-
-
-def _spans(plan: Plan, t: Trajectory) -> list[_Span]:
-    """The contact changes of a trajectory."""
-    out = []
-    for j, (before, after) in enumerate(itertools.pairwise(plan.keyframes)):
-        parts = [x for x in t.segments if x.change == j]
-        begin, end = t.at(float(t.keyframes[j])), parts[-1].end - 1
-        making = next((x for x in parts if x.makes is not None), None)
-        if making is None:
-            out.append(_Span(begin, begin, end, end, None))
-            continue
-        # A limb that is in the air swings from the start.
-        gone = {c.surface for c in before.stance} - {c.surface for c in after.stance}
-        swing = making.begin if gone else begin
-        out.append(_Span(begin, swing, making.end - 1, end, making.makes))
-    return out
-
-
 class Executive:
     """Follows a plan and reacts to what it measures; see the module's docstring.
 
@@ -155,7 +118,7 @@ class Executive:
     some physics steps: a generator that sets the reference and yields once for each.
 
     Attributes:
-        estimate: What is known.
+        estimate: What is known; watch: what it looks out for.
         events: What was measured, and done about it.
         done: Steps of the plan's sequence that have been done.
         left: Physics steps to the end, as far as is known.
@@ -172,14 +135,9 @@ class Executive:
         self._qadr = world.qadr
         speed = plan.options.speed
         self._slow = speed != "max" and speed <= SLOW
-        self._weight = 0.0  # [N] as measured
         self._scale = 1.0  # of the torques: mass as measured over mass as described
-        self._unintended_for = 0.0  # [s]
-        self._unintended: UnintendedContact | None = None
-        self._clearance: dict[tuple[int, str], float] = {}  # extra, see `IK`
-        # Unintended contacts that there is no way around.
-        self._accepted: set[tuple[int, str]] = set()
-        self._retreats = self._searches = 0
+        self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
+        self._searches = 0
         self._k = 0  # physics steps so far
         self.done = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance: it has no steps to count.
@@ -198,7 +156,9 @@ class Executive:
 
     def command(self, measured: Measurement) -> np.ndarray:
         """(na,) servo command of the next physics step."""
-        self._sense(measured)
+        self.estimate.update(measured)
+        if self._slow and self._k % LOOK_STRIDE == 0:
+            self.watch.look(self.estimate.load, self._in_use)
         next(self._behaviour)
         self._k += 1
         ref, q = self._ref, self._balanced()
@@ -228,12 +188,7 @@ class Executive:
     @property
     def stance(self) -> tuple[Contact, ...]:
         """Of the last keyframe that was reached, as planned."""
-        return self._keyframes[self._change].stance
-
-    @property
-    def clearance(self) -> dict[tuple[int, str], float]:
-        """Extra clearance [m] by geom and support, after unintended contacts."""
-        return dict(self._clearance)
+        return self._at_hand.stance
 
     # What it does.
 
@@ -241,30 +196,31 @@ class Executive:
         yield from self._ref.play(FIRST)
         yield from self._check_start()
         while not self.stopped:
-            if self._change < len(self._spans):
-                yield from self._make_change(self._spans[self._change])
-            elif self._goes_on:
+            at_hand = self._at_hand
+            if not at_hand.is_through:
+                yield from self._make_change(at_hand.spans[at_hand.change])
+            elif at_hand.goes_on:
                 yield from self._go_ahead()
             elif not (yield from self._retreat_from_here()):
                 break
-        if self._failure and not self.stopped:
-            self._stop(self._failure)
+        if self._at_hand.failure and not self.stopped:
+            self._stop(self._at_hand.failure)
         yield from self._end()
 
-    def _make_change(self, span: _Span) -> Ticks:
+    def _make_change(self, span: Span) -> Ticks:
         """One contact change: shift, swing, touch, settle."""
         if span.makes is not None and (yield from self._make(span, span.makes)):
             return
         yield from self._ref.play(span.end, until=self._is_unintended)
         self._count_change()
-        if self._unintended is not None:
+        if self.watch.found is not None:
             yield from self._retreat(span.touch, span.makes)
             return
         loaded = [c for c in self.stance if self.estimate.force(c) >= LOST]
         self.estimate.remember(loaded, self.done)
         yield from self._check_stance()
 
-    def _make(self, span: _Span, c: Contact) -> Reaction:
+    def _make(self, span: Span, c: Contact) -> Reaction:
         """Close a contact; false where that went as planned."""
         ref, touches = self._ref, self.estimate.touches
         near = 0.5 * (span.swing + span.touch)
@@ -276,7 +232,7 @@ class Executive:
                 or (ref.i > span.begin and self._is_unintended())
             ),
         )
-        if self._unintended is not None:
+        if self.watch.found is not None:
             yield from self._retreat(span.begin)
             return True
         if ref.i < span.touch and self.estimate.deviation(c)[0] > DEVIATION:
@@ -297,10 +253,11 @@ class Executive:
 
     def _go_ahead(self) -> Ticks:
         """What was planned ahead of a policy has been done: the next steps of it."""
-        key = self._keyframes[-1]
-        found = self._planned(self.estimate.world.scene, key)
+        key = self._at_hand.keyframes[-1]
+        scene, clearance = self.estimate.world.scene, self.watch.clearance
+        found = _rest(self._plan, scene, key, 0.0, clearance)
         if found.trajectory is None:
-            self._goes_on = False
+            self._at_hand.goes_on = False
             if found.failures:
                 self._stop(str(found.failures[0]))
             return
@@ -310,7 +267,7 @@ class Executive:
     def _check_start(self) -> Ticks:
         """Is the robot where it should be, and as heavy?"""
         world = self.estimate.world
-        weight = self._weight = float(self.estimate.load[:, 2].sum())
+        weight = self.watch.weight = float(self.estimate.load[:, 2].sum())
         ratio = weight / (9.81 * world.mass)
         if abs(ratio - 1.0) > MASS_CHANGE:
             self._note(Heavier, factor=ratio)
@@ -330,13 +287,13 @@ class Executive:
             return
         self._note(StartsElsewhere, distance=away, yaw=yaw)
         scene = replace(world.scene, start=np.array([*xy, theta + yaw]))
-        found = self._planned(scene, None, off)
+        found = _rest(self._plan, scene, None, off, NO_EXTRA)
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
     def _check_stance(self) -> Ticks:
         """At a keyframe: the reactions that are due, the most urgent first."""
-        if self._change == len(self._spans) and not self._goes_on:
+        if self._at_hand.is_through and not self._at_hand.goes_on:
             return  # the last one: nothing depends on it
         # What is unintended takes the load of contacts, which are not lost.
         for react in (self._retreat_from_here, self._recover, self._accept):
@@ -350,7 +307,7 @@ class Executive:
         for k in range(n):
             self.left = n - 1 - k
             if self.left == 0:
-                self.rests_on = tuple(self._resting())
+                self.rests_on = tuple(_resting(self.estimate, self.stance))
             yield
 
     # How it reacts.
@@ -367,35 +324,31 @@ class Executive:
 
         `makes` is a contact that carries nothing as yet back there.
         """
-        at = self._unintended
-        assert at is not None
-        self._unintended = None
-        m, key = self.estimate.world.model, (at.geom, at.support)
+        at = self.watch.take()
+        m = self.estimate.world.model
         link = m.body(m.geom_bodyid[at.geom]).name
         self._note(Unintended, link=link, support=at.support)
-        known = self._clearance.get(key, 0.0)
-        self._clearance[key] = CLEARANCE + max(at.distance, known)
-        self._retreats += 1
         yield from self._ref.back(to)
         actual = {c: self.estimate.substitute(c) or c for c in self.stance}
         loaded = [x for c, x in actual.items() if c is not makes]
-        at_hand = self._ref.trajectory
+        at_hand = self._at_hand
         yield from self._replan(tuple(actual.values()), loaded)
-        if self._ref.trajectory is at_hand:
-            self._accepted.add(key)
+        if self._at_hand is at_hand:
+            self.watch.accept(at)
 
     def _take(self, made: Contact, planned: Contact) -> Ticks:
         """A contact is made where it was not planned: the rest is planned again."""
         limb = self._plan.world.robot.limb_of(made.surface)
-        after = self._keyframes[self._change + 1].stance
-        stance = [c for c in after if c.surface not in limb.surfaces]
+        stance = [
+            c for c in self._at_hand.next_stance if c.surface not in limb.surfaces
+        ]
         self._note_moved(made, planned, made=True)
         self._count_change()
         yield from self._replan((*stance, made), stance)
 
     def _seek(self, c: Contact) -> Ticks:
         """A contact is not found where it was planned: another place for the limb."""
-        missing = Missing(time=self._time, surface=c.surface, depth=REACH)
+        missing = Missing(time=self._k * PHYSICS_STEP, surface=c.surface, depth=REACH)
         if self._searches == SEARCHES:
             self._stop(str(missing))
             return
@@ -440,8 +393,8 @@ class Executive:
         Another surface of the limb that meets the support first is the contact.
         """
         stance = self.stance
-        if self._next_contact() is c:
-            after = {x.surface for x in self._keyframes[self._change + 1].stance}
+        if self._at_hand.next_contact is c:
+            after = {x.surface for x in self._at_hand.next_stance}
             stance = tuple(x for x in stance if x.surface in after)
         held = tuple(x for x in stance if x.surface != c.surface)
         ref, estimate = self._ref, self.estimate
@@ -476,40 +429,15 @@ class Executive:
             done=self.done,
         )
         scene = estimate.scene(self._plan.world.scene)
-        found = self._planned(scene, now, off)
+        found = _rest(self._plan, scene, now, off, self.watch.clearance)
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
-
-    def _planned(
-        self, scene: Scene, start: State | Keyframe | None, off: float = 0.0
-    ) -> Plan:
-        """What is left to do, in the scene as it is believed to be.
-
-        Where contacts are so far `off` that the plan at hand will not do, other ones
-        than the demonstrated may.
-        """
-        p = self._plan
-        try:
-            return plan(
-                p.policy or p.sequence,
-                p.world.robot,
-                scene,
-                start=start,
-                options=p.options,
-                contacts="any" if off >= FALLBACK else "demonstrated",
-                budget=Budget(ahead=HORIZON),
-                clearance=NO_EXTRA if start is None else self._clearance,
-            )
-        except InputError as e:
-            failure = Failure(status=Status.UNREACHABLE, detail=str(e))
-            return replace(
-                p, changes=(), failures=(failure,), trajectory=None, complete=False
-            )
 
     def _follow(self, found: Plan, off: float) -> Ticks:
         """Go by another plan; or, where that is worse, by the one at hand."""
         why = str(found.failures[0]) if found.failures else ""
-        if found.trajectory is None or (why and off < FALLBACK and not self._failure):
+        no_better = why and off < FALLBACK and not self._at_hand.failure
+        if found.trajectory is None or no_better:
             yield from self._keep_plan(off, why)
             return
         changes = len(found.changes)
@@ -518,7 +446,7 @@ class Executive:
             return
         self._note(Replanned, changes=changes)
         self._adopt(found, found.trajectory, FIRST)
-        if changes == 0 and not self._goes_on:
+        if changes == 0 and not self._at_hand.goes_on:
             # There is still the way to the last posture.
             yield from self._ref.play(found.trajectory.segments[-1].begin - 1)
 
@@ -526,12 +454,13 @@ class Executive:
         """No other plan was found: the one at hand may do, or may not."""
         if self._steps and self.done == self._steps:
             self._note(KeptStance, why=why)
-            self._change = len(self._spans)
+            self._at_hand.change = len(self._at_hand.spans)
         elif off < FALLBACK:
             self._note(KeptPlan, why=why)
             self._ref.resume()
-            if self._change > 0:
-                yield from self._ref.play(self._spans[self._change - 1].end)
+            if self._at_hand.change > 0:
+                last = self._at_hand.spans[self._at_hand.change - 1]
+                yield from self._ref.play(last.end)
         else:
             self._stop(why)
 
@@ -545,17 +474,10 @@ class Executive:
     def _adopt(self, plan: Plan, trajectory: Trajectory, sample: int) -> None:
         self.estimate.believe(plan.world)
         self._ref.follow(trajectory, sample)
-        self._at_hand, self._keyframes = plan, plan.keyframes
-        self._spans, self._change = _spans(plan, trajectory), 0
-        self._failure = str(plan.failures[0]) if plan.failures else ""
-        self._goes_on = not plan.complete and not plan.failures  # a policy does
-
-    @property
-    def _time(self) -> float:
-        return self._k * PHYSICS_STEP
+        self._at_hand = Progress(plan, trajectory)
 
     def _note(self, kind: type[Event], **what: Any) -> None:
-        self.events.append(kind(time=self._time, **what))
+        self.events.append(kind(time=self._k * PHYSICS_STEP, **what))
 
     def _note_moved(self, c: Contact, planned: Contact, *, made: bool) -> None:
         above, aside = self.estimate.deviation(c)
@@ -564,89 +486,81 @@ class Executive:
 
     def _count_change(self) -> None:
         """The present contact change has been done."""
-        index = self._at_hand.changes[self._change].step.index
-        self._change += 1
+        at_hand = self._at_hand
+        index = at_hand.plan.changes[at_hand.change].step.index
+        at_hand.change += 1
         if index is not None:
             self.done = index + 1
         self._reached.append(self._ref.seconds)
-
-    def _sense(self, measured: Measurement) -> None:
-        self.estimate.update(measured)
-        if self._slow and self._k % LOOK_STRIDE == 0:
-            if load_is_missing(self.estimate.load, self._weight) or self._hit():
-                self._unintended_for += LOOK_STRIDE * PHYSICS_STEP
-            else:
-                self._unintended_for = 0.0
 
     def _balanced(self) -> np.ndarray:
         """(nq,) the reference, its centre of mass moved where balance asks for it."""
         if not self._slow:  # in faster motion the robot need not balance statically
             return self.reference
         if self._k % LOOK_STRIDE == 0:
-            closed = self._closed_contacts()
-            self._balance.update(self.estimate.q, self.reference, closed)
+            now = self.estimate
+            closed = self._at_hand.closed_contacts(self._ref.closed, now.surfaces)
+            self._balance.update(now.q, self.reference, closed)
         q = self.reference.copy()
         q[self._qadr] += self._balance.offset(PHYSICS_STEP)
         return q
 
-    def _near_contacts(self) -> Iterable[Contact]:
-        """Of the keyframes before and after."""
-        near = self._keyframes[self._change : self._change + 2]
-        return (c for key in near for c in key.stance)
-
-    def _closed_contacts(self) -> list[Contact]:
-        """Those of the plan at present."""
-        closed, row = self._ref.closed, self.estimate.row
-        contacts = {c.surface: c for c in self._near_contacts()}
-        return [c for s, c in contacts.items() if closed[row(s)]]
-
-    def _hit(self) -> list[str]:
-        """Surfaces, neither in contact nor about to be, that hit a side."""
-        rows = np.flatnonzero(hit_sideways(self.estimate.load))
-        if not len(rows):
-            return []
-        near = {c.surface for c in self._near_contacts()}
+    def _in_use(self) -> set[str]:
+        """Surfaces in contact or about to be, or loaded in place of one that is."""
+        used = {*self._at_hand.near_contacts()}
         others = map(self.estimate.substitute, self.stance)
-        near.update(c.surface for c in others if c is not None)
-        makes = self._next_contact()
+        used.update(c.surface for c in others if c is not None)
+        makes = self._at_hand.next_contact
         if makes is not None:
-            near.update(self._plan.world.robot.limb_of(makes.surface).surfaces)
-        hit = [self.estimate.surfaces[i] for i in rows]
-        return [s for s in hit if s not in near]
-
-    def _next_contact(self) -> Contact | None:
-        """The contact that the present change makes, if any."""
-        on_way = self._change < len(self._spans)
-        return self._spans[self._change].makes if on_way else None
+            used.update(self._plan.world.robot.limb_of(makes.surface).surfaces)
+        return used
 
     def _is_unintended(self) -> bool:
-        """Is a link loaded where it should not be? Then `_unintended` says which."""
-        if self._unintended_for < UNINTENDED or self._retreats == RETREATS:
+        """Is a link loaded where it should not be? Then `watch` has found it."""
+        if not self.watch.is_due:
             return False
-        self._unintended_for = 0.0
-        estimate, kin = self.estimate, self.estimate.kin
-        kin.update(estimate.q)
-        if load_is_missing(estimate.load, self._weight):
-            found = loaded_link(kin, estimate.load, self._weight)
-        else:
-            found = nearest_of(kin, self._hit())
-        if found and (
-            self._is_moving(found.geom) or (found.geom, found.support) in self._accepted
-        ):
-            found = None
-        self._unintended = found
-        return found is not None
+        makes, world = self._at_hand.next_contact, self.estimate.world
+        # The limb on its way grazes an edge and goes on.
+        moving = () if makes is None else limb_links(world, makes.surface)
+        self.estimate.kin.update(self.estimate.q)
+        load = self.estimate.load
+        return self.watch.find(self.estimate.kin, load, self._in_use, moving)
 
-    def _is_moving(self, geom: int) -> bool:
-        """Whether a geom is of the limb on its way: that grazes an edge and goes on."""
-        makes, world = self._next_contact(), self.estimate.world
-        body = int(world.model.geom_bodyid[geom])
-        return makes is not None and body in limb_links(world, makes.surface)
 
-    def _resting(self) -> Iterable[str]:
-        """Which contacts the robot rests on: those of the stance, as they are."""
-        for c in self.stance:
-            for surface in self._plan.world.robot.limb_of(c.surface).surfaces:
-                other = replace(c, surface=surface)
-                if surface == c.surface or self.estimate.force(other) >= LOST:
-                    yield f"{surface}@{c.support}"
+def _rest(
+    made: Plan,
+    scene: Scene,
+    start: State | Keyframe | None,
+    off: float,
+    clearance: ExtraClearance,
+) -> Plan:
+    """What is left to do of a plan, in the scene as it is believed to be.
+
+    Where contacts are so far `off` that the plan at hand will not do, other ones than
+    the demonstrated may.
+    """
+    try:
+        return plan(
+            made.policy or made.sequence,
+            made.world.robot,
+            scene,
+            start=start,
+            options=made.options,
+            contacts="any" if off >= FALLBACK else "demonstrated",
+            budget=Budget(ahead=HORIZON),
+            clearance=clearance,
+        )
+    except InputError as e:
+        failure = Failure(status=Status.UNREACHABLE, detail=str(e))
+        return replace(
+            made, changes=(), failures=(failure,), trajectory=None, complete=False
+        )
+
+
+def _resting(estimate: Estimate, stance: Sequence[Contact]) -> Iterable[str]:
+    """Which contacts the robot rests on: those of the stance, as they are."""
+    for c in stance:
+        for surface in estimate.world.robot.limb_of(c.surface).surfaces:
+            other = replace(c, surface=surface)
+            if surface == c.surface or estimate.force(other) >= LOST:
+                yield f"{surface}@{c.support}"

@@ -13,7 +13,7 @@ comes nearest to a support there.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,9 @@ MISSING = 0.08  # of the weight that the surfaces do not carry
 SIDEWAYS = 15.0  # [N] and more than the force upwards: a surface hits a side
 SEARCHED = 0.06  # [m] a support is believed no farther from what touches it
 AWAY = 0.20  # [m] from the line of the force, besides what soles leave open
+LASTS = 0.1  # [s] a link is loaded for so long where it should not be: it is
+CLEARANCE = 0.02  # [m] farther than where an unintended contact was
+RETREATS = 4  # as often another way is looked for
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -122,3 +125,92 @@ def _near_supports(
         touch = UnintendedContact(geom, support, float(distance))
         out.append((touch, b if first else a))
     return out
+
+
+class Watch:
+    """Looks out for unintended contacts in slow motion.
+
+    Attributes:
+        weight: Of the robot, as measured [N].
+        found: What was found last and not taken yet.
+        clearance: Extra clearance [m] by geom and support, after those that were found.
+    """
+
+    def __init__(self, surfaces: Sequence[str], period: float) -> None:
+        """Look at the forces on `surfaces`, in order, every `period` [s]."""
+        self.weight = 0.0
+        self.found: UnintendedContact | None = None
+        self.clearance: dict[tuple[int, str], float] = {}
+        self._surfaces, self._period = surfaces, period
+        self._lasted, self._taken = 0.0, 0
+        # Those that there is no way around.
+        self._accepted: set[tuple[int, str]] = set()
+
+    def look(self, load: np.ndarray, in_use: Callable[[], Collection[str]]) -> None:
+        """Does something seem to be loaded that should not? Once every period.
+
+        Args:
+            load: (nS, 3) forces on the surfaces [N].
+            in_use: Gives the surfaces that may be loaded.
+        """
+        if load_is_missing(load, self.weight) or self._hit(load, in_use):
+            self._lasted += self._period
+        else:
+            self._lasted = 0.0
+
+    @property
+    def is_due(self) -> bool:
+        """It has seemed so for long enough to ask what it is."""
+        return self._lasted >= LASTS and self._taken < RETREATS
+
+    def find(
+        self,
+        kin: Kinematics,
+        load: np.ndarray,
+        in_use: Callable[[], Collection[str]],
+        moving: Collection[int],
+    ) -> bool:
+        """Is it an unintended contact? Then it is `found`.
+
+        Args:
+            kin: In the posture as measured.
+            load: (nS, 3) forces on the surfaces [N].
+            in_use: Gives the surfaces that may be loaded.
+            moving: Links that may touch what they like.
+        """
+        self._lasted = 0.0
+        if load_is_missing(load, self.weight):
+            found = loaded_link(kin, load, self.weight)
+        else:
+            found = nearest_of(kin, self._hit(load, in_use))
+        if found is not None and (
+            int(kin.world.model.geom_bodyid[found.geom]) in moving
+            or (found.geom, found.support) in self._accepted
+        ):
+            found = None
+        self.found = found
+        return found is not None
+
+    def _hit(
+        self, load: np.ndarray, in_use: Callable[[], Collection[str]]
+    ) -> list[str]:
+        """Surfaces, none of those in use, that hit a side."""
+        rows = np.flatnonzero(hit_sideways(load))
+        if not len(rows):
+            return []
+        used = in_use()
+        hit = [self._surfaces[int(i)] for i in rows]
+        return [s for s in hit if s not in used]
+
+    def take(self) -> UnintendedContact:
+        """What was found: from now on with more clearance."""
+        at = self.found
+        assert at is not None
+        self.found, key = None, (at.geom, at.support)
+        self.clearance[key] = CLEARANCE + max(at.distance, self.clearance.get(key, 0.0))
+        self._taken += 1
+        return at
+
+    def accept(self, at: UnintendedContact) -> None:
+        """There is no way around it: it is not found again."""
+        self._accepted.add((at.geom, at.support))

@@ -1,0 +1,91 @@
+"""The plan at hand, and how far it has come: its contact changes in samples."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from clamber.contact.contact import Contact
+from clamber.planning.records import Plan
+from clamber.planning.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Span:
+    """A contact change of a trajectory, in samples."""
+
+    begin: int  # sample of the keyframe before
+    swing: int  # first sample with the limb in the air
+    touch: int  # last sample before the new contact is closed
+    end: int
+    makes: Contact | None
+
+
+class Progress:
+    """How far a plan has come.
+
+    Attributes:
+        plan: Its `keyframes` are those before, between and after the changes.
+        spans: Its contact changes.
+        change: How many of them are done: the number of the present one.
+        failure: Why it does not lead to the end; empty where it does.
+        goes_on: It is a policy's, planned some changes ahead.
+    """
+
+    def __init__(self, plan: Plan, trajectory: Trajectory) -> None:
+        """At the beginning of the plan, timed as this trajectory."""
+        self.plan, self.keyframes = plan, plan.keyframes
+        self.spans, self.change = _spans(plan, trajectory), 0
+        self.failure = str(plan.failures[0]) if plan.failures else ""
+        self.goes_on = not plan.complete and not plan.failures
+
+    @property
+    def is_through(self) -> bool:
+        """All changes are done."""
+        return self.change == len(self.spans)
+
+    @property
+    def stance(self) -> tuple[Contact, ...]:
+        """Of the last keyframe that was reached, as planned."""
+        return self.keyframes[self.change].stance
+
+    @property
+    def next_stance(self) -> tuple[Contact, ...]:
+        """Of the keyframe that comes next."""
+        return self.keyframes[self.change + 1].stance
+
+    @property
+    def next_contact(self) -> Contact | None:
+        """The contact that the present change makes, if any."""
+        return None if self.is_through else self.spans[self.change].makes
+
+    def near_contacts(self) -> dict[str, Contact]:
+        """Of the keyframes before and after, by surface."""
+        near = self.keyframes[self.change : self.change + 2]
+        return {c.surface: c for key in near for c in key.stance}
+
+    def closed_contacts(
+        self, closed: np.ndarray, surfaces: tuple[str, ...]
+    ) -> list[Contact]:
+        """Those whose surfaces, of nS in order, are in contact: (nS,) bool."""
+        row = surfaces.index
+        return [c for s, c in self.near_contacts().items() if closed[row(s)]]
+
+
+def _spans(plan: Plan, t: Trajectory) -> list[Span]:
+    """The contact changes of a trajectory."""
+    out = []
+    for j, (before, after) in enumerate(itertools.pairwise(plan.keyframes)):
+        parts = [x for x in t.segments if x.change == j]
+        begin, end = t.at(float(t.keyframes[j])), parts[-1].end - 1
+        making = next((x for x in parts if x.makes is not None), None)
+        if making is None:
+            out.append(Span(begin, begin, end, end, None))
+            continue
+        # A limb that is in the air swings from the start.
+        gone = {c.surface for c in before.stance} - {c.surface for c in after.stance}
+        swing = making.begin if gone else begin
+        out.append(Span(begin, swing, making.end - 1, end, making.makes))
+    return out
