@@ -225,6 +225,7 @@ class ReplanCommand:
         return self._ranked() if self.begin is None else self._rest(self.begin)
 
     def _ranked(self) -> int:
+        from clamber.planning.records import told
         from clamber.run.folder import save_replanned
 
         sequence = clamber.load_sequence(self.source)
@@ -256,8 +257,7 @@ class ReplanCommand:
                 "" if r.stable else outcome(r.plan),
             )
         stable = found.best.stable
-        tried = "; ".join(map(str, found.tried))
-        note = "the best one is planned" if stable else f"none is stable: {tried}"
+        note = "the best one is planned" if stable else told(found.tried)
         self.output.show({}, table, note=closing(note, folder, stable))
         return REACHED if found.best.stable else MISSED
 

@@ -108,7 +108,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:
-    """What a proposer came to; as a string, a clause.
+    """What a proposer came to.
 
     Attributes:
         proposer: As of `Attempt`.
@@ -121,11 +121,6 @@ class Tried:
     steps: int
     failed: int
     last: str
-
-    def __str__(self) -> str:
-        """Who tried how much."""
-        why = f", {self.failed} of them failed, the last: {self.last}"
-        return f"{self.proposer}: {self.steps} steps{why if self.failed else ''}"
 
 
 def summary(attempts: Iterable[Attempt]) -> tuple[Tried, ...]:
@@ -142,6 +137,19 @@ def summary(attempts: Iterable[Attempt]) -> tuple[Tried, ...]:
         )
         out.append(row)
     return tuple(out)
+
+
+def told(tried: Sequence[Tried]) -> str:
+    """One clause: what was tried besides the demonstrated contacts, in vain."""
+    others = [t for t in tried if t.proposer not in ("demonstrated", "search")]
+    said = "there is no alternative"
+    if others:
+        n, last = sum(t.steps for t in others), others[-1].last
+        said = f"none of {len(others)} alternatives has one ({n} steps tried: {last})"
+    for t in tried:
+        if t.proposer == "search":
+            said += f"; nor has the search ({t.steps} steps tried: {t.last})"
+    return said
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -239,8 +247,7 @@ class Fallback:
         if self.source in how:
             used = f"instead, {how[self.source]}: {', '.join(self.surfaces)}"
             return f"{self.reason}; {used}"
-        tried = "" if self.source else "; ".join(map(str, self.tried))
-        tried = f"what was tried: {tried}" if tried else ""
+        tried = "" if self.source or not self.tried else told(self.tried)
         return "; ".join(filter(None, (self.reason, self.detail, tried)))
 
 
