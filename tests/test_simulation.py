@@ -10,7 +10,12 @@ import pytest
 
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Replanned, Stopped
-from clamber.execution.simulation import simulate
+from clamber.execution.simulation import (
+    FALLEN_HEIGHT,
+    FALLEN_TILT,
+    has_fallen,
+    simulate,
+)
 from clamber.execution.verdict import (
     END_SPEED,
     GOAL_TOL,
@@ -126,6 +131,21 @@ def test_progress_goes_from_nothing_to_all(start_only):
 def test_a_plan_without_a_trajectory_cannot_be_simulated(demo_plan):
     with pytest.raises(ValueError, match="no trajectory"):
         simulate(replace(demo_plan, trajectory=None))
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_it_has_fallen_where_the_pelvis_is_far_from_its_reference(demo_plan, share):
+    q = demo_plan.trajectory.q[0]
+    low, high = q.copy(), q.copy()
+    low[2] -= share * FALLEN_HEIGHT
+    high[2] += 10 * FALLEN_HEIGHT
+    assert has_fallen(low, q) == (share > 1)
+    assert not has_fallen(high, q)
+    upright = q.copy()
+    upright[3:7] = [1.0, 0.0, 0.0, 0.0]
+    for axis in (0, 1, 2):
+        tilted = turned(upright, axis, share * FALLEN_TILT)
+        assert has_fallen(tilted, upright) == (share > 1 and axis < 2)
 
 
 # Forces.
