@@ -144,7 +144,9 @@ class Executive:
         by_policy = plan.policy is not None
         steps = [] if by_policy else split_steps(plan.sequence, plan.world)[0]
         self._steps = len(steps)
-        self._reached = [float(plan.trajectory.keyframes[0])]  # [s] each keyframe
+        self._begun = self.done
+        # [s] when each keyframe of the plan was reached
+        self._reached = [float(plan.trajectory.keyframes[0])]
         self.left = len(plan.trajectory.time)
         self.events: list[Event] = []
         self.stopped = ""
@@ -489,9 +491,12 @@ class Executive:
         at_hand = self._at_hand
         index = at_hand.plan.changes[at_hand.change].step.index
         at_hand.change += 1
+        now, n = self._ref.seconds, len(self._reached)
         if index is not None:
             self.done = index + 1
-        self._reached.append(self._ref.seconds)
+            n = self.done - self._begun  # one that is made again counts once
+        self._reached += [now] * (n - len(self._reached))
+        self._reached[n:] = [now]
 
     def _balanced(self) -> np.ndarray:
         """(nq,) the reference, its centre of mass moved where balance asks for it."""
