@@ -290,6 +290,12 @@ def test_where_nothing_is_found_it_says_what_was_tried(
     assert "search" not in {t.proposer for t in none.fallback.tried}
 
 
+def test_where_the_time_is_over_nothing_else_is_tried(demo_sequence, coman):
+    found = plan(demo_sequence, coman, LOW, budget=Budget(seconds=0.0))
+    assert [f.status for f in found.failures] == [Status.BUDGET]
+    assert found.fallback is None
+
+
 def test_contacts_without_alternatives_are_tried_once(failing, demo_sequence, coman):
     """The only combination is the demonstrated one, which has just failed."""
     failing("LKnee")

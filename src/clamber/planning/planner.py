@@ -325,8 +325,10 @@ class _Task:
 
     def fallback(self, first: Plan) -> Plan:
         """The best of other contacts; else `first`, and what was tried."""
-        if isinstance(self._goal, GeneralPolicy) or self._unsettled:
-            return first  # a policy has its own; and without a stance there is nothing
+        if isinstance(self._goal, GeneralPolicy):
+            return first  # it has its own
+        if self._unsettled or self._search.late:
+            return first
         reason = f"no stable plan as demonstrated ({first.failures[0]})"
         best = self.ranked(first)[0]
         tried = summary(self._search.attempts)
