@@ -107,28 +107,12 @@ def test_keyframes_are_reached_when_the_plan_says(plan: Plan, rollout: Rollout):
     assert sample.keyframe_times(bare, None) == [0.0, 1.0]
 
 
-def test_keyframes_of_an_adapted_run_are_found_by_their_contacts(
+def test_keyframes_of_an_adapted_run_are_reached_when_it_says(
     plan: Plan, rollout: Rollout
 ):
-    first = plan.trajectory
-    assert first is not None
-    wait = 400  # samples that the robot stood still before it began
-
-    def later(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.repeat(x[:1], wait, axis=0), x])
-
-    followed = replace(
-        first,
-        time=np.arange(len(first.time) + wait) * 0.001,
-        q=later(first.q),
-        v=later(first.v),
-        tau=later(first.tau),
-        contact=later(first.contact),
-        keyframes=np.zeros(1),
-    )
-    adapted = replace(rollout, followed=followed, time=rollout.time + 0.4)
-    start, hand = sample.keyframe_times(plan, adapted)
-    assert start == pytest.approx(0.0, abs=0.5)
-    assert hand == pytest.approx(first.keyframes[1] + 0.4, abs=0.3)
-    never = replace(followed, contact=np.zeros_like(followed.contact))
-    assert sample.keyframe_times(plan, replace(adapted, followed=never)) == [None] * 2
+    t = plan.trajectory
+    assert t is not None
+    later = replace(rollout, followed=replace(t, keyframes=np.array([0.0, 3.5])))
+    assert sample.keyframe_times(plan, later) == [0.0, 3.5]
+    never = replace(rollout, followed=replace(t, keyframes=np.zeros(1)))
+    assert sample.keyframe_times(plan, never) == [0.0, None]

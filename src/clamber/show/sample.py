@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,7 +46,6 @@ from clamber.step.stability import contact_points
 from clamber.step.statics import Phase, projected_distance, theta_max
 
 SAMPLES_A_SECOND = 25
-SAME_POSTURE = 1e-3  # [rad]
 SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
 LOADED = 0.01  # [weights] a surface that bears more is loaded
 TOUCHING = 0.005  # [m] a bearing point nearer to its support than this bears
@@ -200,42 +198,16 @@ def _force_by_surface(equilibrium: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
-    """When each keyframe is reached [s]; None where the run never gets there.
-
-    A plan that was adapted has times of its own: there a keyframe is looked for among
-    the spells with its contacts, each after the one before, and is where the reference
-    is nearest to its posture, for the last time.
-    """
+    """When each keyframe is reached [s]; None where the run never gets there."""
+    n = len(plan.keyframes)
     if plan.trajectory is None:
-        if rollout is None:  # the keyframes alone, a second each
-            return [float(i) for i in range(len(plan.keyframes))]
-        return [None] * len(plan.keyframes)
+        # The keyframes alone, a second each.
+        return [float(i) if rollout is None else None for i in range(n)]
     followed = None if rollout is None else rollout.followed
     end = math.inf if rollout is None else float(rollout.time[-1]) + 0.02
-    if followed is None:
-        known = [float(t) for t in plan.trajectory.keyframes]
-        known += [math.inf] * (len(plan.keyframes) - len(known))
-        return [t if t <= end else None for t in known[: len(plan.keyframes)]]
-    changes = np.flatnonzero(np.any(np.diff(followed.contact, axis=0), axis=1)) + 1
-    spells = list(pairwise([0, *changes.tolist(), len(followed.time)]))
-    times: list[float | None] = []
-    first = 0
-    joints = plan.world.qadr
-    for key in plan.keyframes:
-        wanted = {c.surface for c in key.stance}
-        found = None
-        for k in range(first, len(spells)):
-            a, b = spells[k]
-            row = followed.contact[a]
-            now = {s for s, x in zip(followed.surfaces, row, strict=True) if x}
-            if now == wanted and followed.time[a] <= end:
-                gap = np.abs(followed.q[a:b, joints] - key.q[joints]).max(axis=1)
-                near = np.flatnonzero(gap <= gap.min() + SAME_POSTURE)
-                last = near[-1] if times else 0  # the run begins with the first one
-                found, first = min(float(followed.time[a + last]), end), k + 1
-                break
-        times.append(found)
-    return times
+    known = (followed or plan.trajectory).keyframes.tolist()[:n]
+    known += [math.inf] * (n - len(known))
+    return [t if t <= end else None for t in known]
 
 
 def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
