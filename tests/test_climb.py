@@ -60,7 +60,7 @@ def test_the_command_of_a_job_is_that_job(job: Climb):
     assert climb.planning.speed == job.speed
     assert climb.execution.controller == job.controller
     assert climb.execution.disturb == job.disturb
-    assert (climb.contacts, climb.search.read()["bounds"]) == (job.contacts, job.search)
+    assert (climb.contacts, climb.search.read()["budget"]) == (job.contacts, job.search)
 
 
 def test_a_command_names_what_differs_and_no_more():
@@ -79,7 +79,7 @@ def test_flags_have_the_defaults_of_the_command():
     assert (climb.planning.method, climb.planning.speed) == (job.method, job.speed)
     assert climb.execution.controller == job.controller
     assert climb.execution.disturb == job.disturb
-    assert (climb.contacts, climb.search.read()["bounds"]) == (job.contacts, job.search)
+    assert (climb.contacts, climb.search.read()["budget"]) == (job.contacts, job.search)
 
 
 def test_flags_are_checked_one_by_one():

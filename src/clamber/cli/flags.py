@@ -146,7 +146,7 @@ class ExecutionFlags:
     """How to execute, and in which world."""
 
     controller: Literal["pid", "mixed"] = "mixed"
-    """pid: open loop. mixed: compliant joints, contacts are felt, plans adapted."""
+    """pid: open loop. mixed: compliant joints, contacts are measured, plans adapted."""
     disturb: Disturbance = field(default_factory=Disturbance)
     """What the planner does not know of the true world."""
 
