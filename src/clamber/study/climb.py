@@ -167,7 +167,7 @@ def run_climb(climb: Climb) -> ClimbResult:
     except InputError as e:
         return ClimbResult(reached=False, why=f"no plan: {e}")
     verdict = judge(made, rollout)
-    wrong = [name for name, c in verdict.criteria.items() if not c.ok]
+    wrong = [str(name) for name, c in verdict.criteria.items() if not c.ok]
     if rollout.fell:
         wrong.insert(0, "fell")
     elif rollout.stopped:
