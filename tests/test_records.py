@@ -8,6 +8,7 @@ import pytest
 
 import clamber
 from clamber.model.records import frozen_array, short_repr
+from records import records_in
 
 
 class Kind(enum.Enum):
@@ -53,3 +54,13 @@ def test_a_frozen_array_is_a_copy_that_nobody_writes_to():
         x[0] = 0.0
     with pytest.raises(ValueError, match="shape"):
         frozen_array(given, (3,))
+
+
+def test_the_repr_of_whatever_a_run_is_made_of_is_short(
+    one_hand_plan, one_hand_rollout, demo_sequence
+):
+    demo = clamber.load_demo("climb")
+    verdict = clamber.judge(one_hand_plan, one_hand_rollout)
+    whole = (one_hand_plan, one_hand_rollout, verdict, demo_sequence, demo)
+    long = {type(x).__name__: repr(x) for x in records_in(whole) if len(repr(x)) >= 300}
+    assert not long

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.model.records import short_repr
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
 
@@ -21,6 +22,8 @@ class Span:
     touch: int  # last sample before the new contact is closed
     end: int
     makes: Contact | None
+
+    __repr__ = short_repr
 
 
 class Progress:

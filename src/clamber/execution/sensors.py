@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber.model.records import short_repr
 from clamber.model.world import PHYSICS_STEP, World
 
 ANGLE_NOISE = 5e-4  # [rad] rms of a joint encoder
@@ -35,6 +36,8 @@ class Measurement:
 
     q: np.ndarray
     force: np.ndarray
+
+    __repr__ = short_repr
 
 
 class Sensors:

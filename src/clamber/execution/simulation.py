@@ -23,6 +23,7 @@ from clamber.execution.sensors import (
     rows_of_geoms,
 )
 from clamber.execution.servo import ControlMode, driven_world
+from clamber.model.records import short_repr
 from clamber.model.scene import Scene
 from clamber.model.se3 import upward
 from clamber.model.world import PHYSICS_STEP, World
@@ -83,6 +84,8 @@ class Rollout:
     events: tuple[Event, ...] = ()
     fell: bool = False
     rests_on: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     @property
     def stopped(self) -> str:

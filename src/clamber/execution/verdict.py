@@ -14,6 +14,7 @@ import numpy as np
 from clamber.contact.steps import on_feet
 from clamber.execution.simulation import END, Rollout
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.scene import GROUND
 from clamber.model.se3 import upward, wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World
@@ -70,6 +71,8 @@ class Verdict:
     reached: bool
     criteria: dict[Figure, Criterion]
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Figures:
@@ -94,6 +97,8 @@ class Figures:
     self_penetration: float
     self_pair: str
     effort: float
+
+    __repr__ = short_repr
 
 
 def measure(rollout: Rollout) -> Figures:

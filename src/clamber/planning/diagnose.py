@@ -10,6 +10,7 @@ import numpy as np
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics, limb_lengths
 from clamber.model.limbs import DENSEST, geom_volume
+from clamber.model.records import short_repr
 from clamber.model.robot import Robot
 from clamber.model.scene import Box, Scene
 from clamber.model.world import World, build_world
@@ -47,6 +48,8 @@ class Checkup:
     knee_height: float
     com_height: float
     faults: tuple[str, ...]
+
+    __repr__ = short_repr
 
 
 def check_robot(robot: Robot) -> Checkup:

@@ -24,6 +24,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.robot import Robot
 from clamber.model.scene import GROUND
 from clamber.planning.records import Plan
@@ -41,6 +42,8 @@ class Alternative:
 
     surfaces: tuple[str, ...]
     sequence: ContactSequence
+
+    __repr__ = short_repr
 
 
 def contact_differences(sequence: ContactSequence) -> tuple[tuple[str, ...], ...]:

@@ -21,6 +21,7 @@ import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.step.polygon import support_polygon
 from clamber.step.stability import EFFORT_SHARE, contact_points, point_jacobians
 from clamber.step.statics import cone_generators
@@ -59,6 +60,8 @@ class Demand:
     velocity: np.ndarray
     jacobian: np.ndarray
     cones: np.ndarray
+
+    __repr__ = short_repr
 
 
 def demand_at(

@@ -23,6 +23,7 @@ from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.se3 import quat_conjugate, quat_multiply
 from clamber.model.world import World
 from clamber.planning.timing import GRID, demand_at, least_torques, retime
@@ -141,6 +142,8 @@ class Segment:
     end: int
     makes: Contact | None = None
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Trajectory:
@@ -165,6 +168,8 @@ class Trajectory:
     joints: tuple[str, ...]
     keyframes: np.ndarray
     segments: tuple[Segment, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check shapes, make arrays read-only."""

@@ -22,6 +22,7 @@ import numpy as np
 from clamber.errors import InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.planning.trajectory import RATE, Trajectory
 from clamber.run.codec import whole_file
@@ -58,6 +59,8 @@ class Motion:
     contact: np.ndarray
     force: np.ndarray | None
     lead_in: int = 0
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

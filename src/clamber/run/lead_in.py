@@ -23,6 +23,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.errors import InputError, read_yaml
 from clamber.model.kinematics import Kinematics
+from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.planning.trajectory import holding_torque
 
@@ -43,6 +44,8 @@ class States:
     q: np.ndarray
     v: np.ndarray
     tau: np.ndarray
+
+    __repr__ = short_repr
 
     def then(self, after: States) -> States:
         """This, then another."""
