@@ -55,7 +55,7 @@ type: $(VENV)/.has-view $(VENV)/.has-video $(VENV)/.has-test $(VENV)/.has-dev ##
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same jobs in other libraries
-	@for f in benchmarks/*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
+	@for f in benchmarks/bench_*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
 
 pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a climb
 	rm -rf build/climb
