@@ -183,7 +183,10 @@ def test_a_scene_without_the_box_is_refused(demo_sequence, coman):
     assert error.value.field == "scene.boxes"
 
 
-def test_a_box_that_is_near_but_too_high_is_an_incomplete_plan(demo_sequence, coman):
+def test_a_box_that_is_near_but_too_high_is_an_incomplete_plan(
+    demo_sequence, coman, monkeypatch
+):
+    monkeypatch.setattr("clamber.planning.planner.VARIATIONS", ({},))
     scene = Scene.from_height(0.75)
     result = plan(demo_sequence, coman, scene, contacts="demonstrated")
     assert not result.complete
