@@ -409,7 +409,7 @@ def test_without_dask_the_extra_is_named(
 
 
 def test_dask_is_not_loaded_for_a_local_sweep():
-    code = "import sys, clamber.sweep; print('distributed' in sys.modules)"
+    code = "import sys, clamber.study.sweep; print('distributed' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert out.stdout == "False\n"
 
