@@ -4,7 +4,7 @@
 
 Both are given points, normals, friction and centre of mass afresh each time, build
 pyramids with the same edges inside the friction cones, and answer whether forces within
-them balance gravity. Also times the other functions of `clamber.statics`.
+them balance gravity. Also times the other functions of `clamber.step.statics`.
 """
 
 from __future__ import annotations
