@@ -20,7 +20,7 @@ from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
-from clamber.run import folder as io
+from clamber.run import folder as run_files
 from clamber.show import pictures, renderer
 from clamber.show.sample import force_by_contact, thinned
 
@@ -143,8 +143,8 @@ def test_long_runs_are_shown_faster_by_a_power_of_two(seconds: float, speedup: i
 def test_a_run_is_drawn_whole_and_twice_the_same(
     plan: Plan, rollout: Rollout, tmp_path: Path, opengl: None
 ):
-    io.save_plan(plan, tmp_path)
-    io.save_rollout(plan, rollout, tmp_path)
+    run_files.save_plan(plan, tmp_path)
+    run_files.save_rollout(plan, rollout, tmp_path)
     told: list[tuple[str, float]] = []
     files = pictures.render_run(
         tmp_path,
@@ -167,7 +167,7 @@ def test_a_run_is_drawn_whole_and_twice_the_same(
 def test_a_plan_alone_shows_its_keyframes_with_their_contacts(
     plan: Plan, tmp_path: Path, opengl: None
 ):
-    io.save_plan(plan, tmp_path)
+    run_files.save_plan(plan, tmp_path)
     assert [f.name for f in pictures.render_run(tmp_path)] == ["keyframes.png"]
     green = pictures.PHASE_COLOURS["supporting"]
     sheet = pixels(tmp_path / "keyframes.png")
@@ -228,8 +228,8 @@ def test_without_ffmpeg_the_video_is_a_webp(
 def test_without_opengl_plots_are_drawn_and_the_reason_is_one_sentence(
     plan: Plan, rollout: Rollout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    io.save_plan(plan, tmp_path)
-    io.save_rollout(plan, rollout, tmp_path)
+    run_files.save_plan(plan, tmp_path)
+    run_files.save_rollout(plan, rollout, tmp_path)
     monkeypatch.setattr(renderer, "gl_backend", lambda: None)
     with pytest.raises(ClamberError, match="apt-get install libegl1") as e:
         pictures.render_run(tmp_path)
@@ -261,9 +261,9 @@ def test_what_does_without_a_broken_file_is_drawn_before_that_is_named(
     tmp_path: Path,
     opengl: None,
 ):
-    io.save_plan(plan, tmp_path)
-    io.save_rollout(plan, rollout, tmp_path)
-    io.save_timings(tmp_path, {"plan": 1.0})
+    run_files.save_plan(plan, tmp_path)
+    run_files.save_rollout(plan, rollout, tmp_path)
+    run_files.save_timings(tmp_path, {"plan": 1.0})
     (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:100])
     with pytest.raises(InputError, match=name):
         pictures.render_run(tmp_path, with_video=False)
@@ -341,7 +341,7 @@ def test_a_frame_shows_the_state_at_its_time(
 
 
 def test_a_frame_of_a_plan_needs_no_physics(plan: Plan, tmp_path: Path, opengl: None):
-    io.save_plan(plan, tmp_path)
+    run_files.save_plan(plan, tmp_path)
     path = pictures.render_frame(tmp_path, 0.5, size=SIZE)
     assert path == tmp_path / "frame-0.5.png"
     assert pixels(path).std() > 10

@@ -22,7 +22,7 @@ from clamber.execution.simulation import STRIDE, Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.records import Fallback, Plan
-from clamber.run import folder as io
+from clamber.run import folder as run_files
 from clamber.show import report
 
 NASTY = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>"
@@ -41,7 +41,7 @@ def rollout(one_hand_rollout: Rollout) -> Rollout:
 @pytest.fixture(scope="module")
 def planned(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("planned")
-    io.save_plan(plan, folder)
+    run_files.save_plan(plan, folder)
     return folder
 
 
@@ -193,7 +193,7 @@ def test_a_plan_alone_is_animated_without_forces(planned: Path):
 
 
 def test_a_plan_that_got_no_trajectory_shows_its_keyframes(plan: Plan, tmp_path: Path):
-    io.save_plan(replace(plan, trajectory=None, complete=False), tmp_path)
+    run_files.save_plan(replace(plan, trajectory=None, complete=False), tmp_path)
     record = report.run_record(tmp_path)
     assert record["motion"]["stills"]
     assert times(record).tolist() == [0.0, 1.0]
@@ -201,11 +201,11 @@ def test_a_plan_that_got_no_trajectory_shows_its_keyframes(plan: Plan, tmp_path:
 
 
 def test_a_plan_with_other_contacts_says_so(plan: Plan, tmp_path: Path):
-    io.save_plan(
+    run_files.save_plan(
         replace(plan, fallback=Fallback(reason="hands instead of elbows")), tmp_path
     )
     assert report.run_record(tmp_path)["instead"] == "hands instead of elbows"
-    io.save_plan(plan, tmp_path)
+    run_files.save_plan(plan, tmp_path)
     assert report.run_record(tmp_path)["instead"] == ""
 
 
@@ -225,9 +225,9 @@ def test_a_fall_and_a_stop_and_what_was_felt_are_told(
     plan: Plan, rollout: Rollout, tmp_path: Path
 ):
     events = (Lost(time=0.5, surface="LHand"), Stopped(time=0.5, why="nothing to hold"))
-    io.save_plan(plan, tmp_path)
+    run_files.save_plan(plan, tmp_path)
     fallen = replace(rollout, fell=True, events=events)
-    io.save_rollout(plan, fallen, tmp_path)
+    run_files.save_rollout(plan, fallen, tmp_path)
     record = report.run_record(tmp_path)
     assert record["fell"]
     assert record["stopped"] == "nothing to hold"
@@ -490,10 +490,10 @@ def test_it_prints(page: tuple[Any, list[str]]):
 def test_a_run_that_ended_at_once_opens(
     browser: Any, plan: Plan, rollout: Rollout, tmp_path: Path
 ):
-    io.save_plan(plan, tmp_path)
+    run_files.save_plan(plan, tmp_path)
     arrays = ("time", "qpos", "qvel", "actuator_force", "contact_force", "unintended")
     first = {name: getattr(rollout, name)[:1] for name in arrays}
-    io.save_rollout(plan, replace(rollout, **first, fell=True), tmp_path)
+    run_files.save_rollout(plan, replace(rollout, **first, fell=True), tmp_path)
     p, complaints = opened(browser, report.write_report(tmp_path).file)
     assert "The robot fell" in p.inner_text("header")
     assert complaints == []

@@ -365,13 +365,13 @@ class SweepCommand:
     def run(self) -> int:
         """Spec to table and curves."""
         from clamber.study import curves, sweep
-        from clamber.study import spec as experiment
+        from clamber.study.spec import load_spec
 
         if self.workers is not None and self.workers < 1:
             raise InputError("1 or more", source="--workers", value=self.workers)
         if self.workers is not None and self.scheduler is not None:
             raise InputError("--workers, --scheduler: give one of them alone")
-        spec = experiment.load_spec(self.spec)
+        spec = load_spec(self.spec)
         folder = self.out or Path("runs") / self.spec.stem
         sweep.check_inputs(spec)
         try:
