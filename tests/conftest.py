@@ -251,6 +251,18 @@ def one_hand_rollout(one_hand_plan):
     return simulate(one_hand_plan, controller="pid")
 
 
+@pytest.fixture(scope="session")
+def plan(one_hand_plan):
+    """For short, where one plan is as good as another."""
+    return one_hand_plan
+
+
+@pytest.fixture(scope="session")
+def rollout(one_hand_rollout):
+    """Of that plan."""
+    return one_hand_rollout
+
+
 @pytest.fixture(scope="module")
 def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
     """The run folder of that motion; of the module alone, which may write in it."""

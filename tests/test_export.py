@@ -29,16 +29,6 @@ TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
 @pytest.fixture(scope="module")
-def plan(one_hand_plan: Plan) -> Plan:
-    return one_hand_plan
-
-
-@pytest.fixture(scope="module")
-def rollout(one_hand_rollout: Rollout) -> Rollout:
-    return one_hand_rollout
-
-
-@pytest.fixture(scope="module")
 def t(plan: Plan) -> Trajectory:
     assert plan.trajectory is not None
     return plan.trajectory

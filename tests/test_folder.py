@@ -58,16 +58,6 @@ PLAN_FILES = {
 
 
 @pytest.fixture(scope="module")
-def plan(one_hand_plan: Plan) -> Plan:
-    return one_hand_plan
-
-
-@pytest.fixture(scope="module")
-def rollout(one_hand_rollout: Rollout) -> Rollout:
-    return one_hand_rollout
-
-
-@pytest.fixture(scope="module")
 def saved(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     save_sequence(plan.sequence, folder / SEQUENCE)

@@ -27,16 +27,6 @@ from clamber.show.sample import force_by_contact, thinned
 SIZE = (160, 120)
 
 
-@pytest.fixture(scope="module")
-def plan(one_hand_plan: Plan) -> Plan:
-    return one_hand_plan
-
-
-@pytest.fixture(scope="module")
-def rollout(one_hand_rollout: Rollout) -> Rollout:
-    return one_hand_rollout
-
-
 @pytest.fixture
 def opengl() -> None:
     if renderer.gl_backend() is None:

@@ -29,16 +29,6 @@ NASTY = "</script><script>document.title='taken'</script><img src=x onerror=aler
 
 
 @pytest.fixture(scope="module")
-def plan(one_hand_plan: Plan) -> Plan:
-    return one_hand_plan
-
-
-@pytest.fixture(scope="module")
-def rollout(one_hand_rollout: Rollout) -> Rollout:
-    return one_hand_rollout
-
-
-@pytest.fixture(scope="module")
 def planned(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("planned")
     run_files.save_plan(plan, folder)

@@ -13,17 +13,6 @@ from clamber.planning.records import Plan
 from clamber.recording.demonstration import runs
 from clamber.show import sample
 
-
-@pytest.fixture(scope="module")
-def plan(one_hand_plan: Plan) -> Plan:
-    return one_hand_plan
-
-
-@pytest.fixture(scope="module")
-def rollout(one_hand_rollout: Rollout) -> Rollout:
-    return one_hand_rollout
-
-
 # Series.
 
 

@@ -97,16 +97,7 @@ class ClimbCommand:
                     sequence, robot, scene, self.planning, folder, report, others
                 )
             done = self.execution.simulate(plan, folder, report, None)
-            missing = []
-            try:
-                clamber.render_run(
-                    folder,
-                    with_video=self.video,
-                    demonstration=(demo, sequence),
-                    report=report,
-                )
-            except ClamberError as e:  # the robot has climbed all the same
-                missing.append(str(e))
+            missing = _draw(folder, self.video, report, (demo, sequence))
             _save_timings(folder, clock)
         self.output.warn(*missing)
         return conclude(self.output, folder, plan, done, clock)
@@ -344,11 +335,7 @@ class TraverseCommand:
             done = None
             if plan.complete:
                 done = self.execution.simulate(plan, folder, report, None)
-            missing = []
-            try:
-                clamber.render_run(folder, with_video=self.video, report=report)
-            except ClamberError as e:  # the robot has crossed all the same
-                missing.append(str(e))
+            missing = _draw(folder, self.video, report)
             _save_timings(folder, clock)
         self.output.warn(*missing)
         return conclude(self.output, folder, plan, done, clock)
@@ -481,6 +468,22 @@ def _plan(
     clamber.save_plan(result, folder)
     report("save", 1.0, "")
     return result
+
+
+def _draw(
+    folder: Path,
+    video: bool,
+    report: Report,
+    demonstration: tuple[clamber.Demonstration, clamber.ContactSequence] | None = None,
+) -> list[str]:
+    """Draw a run; what could not be drawn: the robot has made it all the same."""
+    try:
+        clamber.render_run(
+            folder, with_video=video, demonstration=demonstration, report=report
+        )
+    except ClamberError as e:
+        return [str(e)]
+    return []
 
 
 def _save_timings(folder: Path, clock: Clock) -> None:

@@ -17,7 +17,7 @@ from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
-from clamber.recording.built_in import BUILT_IN
+from clamber.recording.built_in import BUILT_IN, source_of
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import PLAN, SEQUENCE, fallback_note, load_sequence
@@ -123,7 +123,7 @@ def _named_recording(sequence: ContactSequence | None, run: Run) -> str | None:
     if sequence is not None:
         source = sequence.source
     for name in BUILT_IN:
-        if source == load_demo(name).source:
+        if source == source_of(name):
             return name
     return source if source and Path(source).is_file() else None
 
