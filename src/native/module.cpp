@@ -1,0 +1,11 @@
+// The extension module `clamber._core`: each part binds itself.
+#include <nanobind/nanobind.h>
+
+#include "bindings.h"
+
+NB_MODULE(_core, m) {
+    m.doc() = "Native core: kinematics, distances, postures, paths, statics.";
+    clamber::bind_statics(m);
+    clamber::bind_geometry(m);
+    clamber::bind_servo(m);
+}

@@ -1,0 +1,7 @@
+#include "bindings.h"
+
+namespace clamber {
+
+void bind_servo(nb::module_&) {}
+
+}  // namespace clamber

@@ -1,0 +1,7 @@
+#include "bindings.h"
+
+namespace clamber {
+
+void bind_statics(nb::module_&) {}
+
+}  // namespace clamber
