@@ -59,6 +59,27 @@ def test_the_hull_survives_noise_in_the_last_bits():
             assert np.min(np.linalg.norm(polygon - corner, axis=1)) < 2e-9
 
 
+def test_a_hull_of_many_points_is_that_of_its_vertices():
+    rng = np.random.default_rng(8)
+    points = rng.normal(size=(5000, 2))
+    vertices = points[ConvexHull(points).vertices]
+    np.testing.assert_array_equal(support_polygon(points), support_polygon(vertices))
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, 1e300])
+def test_points_without_a_place_have_no_hull(x):
+    with pytest.raises(ValueError, match="finite points"):
+        support_polygon(np.array([[0.0, 0.0], [0.0, x], [1.0, 0.0]]))
+
+
+def test_a_hull_has_at_most_64_vertices():
+    angles = np.linspace(0, 2 * math.pi, 65, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    assert len(support_polygon(circle[:64])) == 64
+    with pytest.raises(ValueError, match="at most 64"):
+        support_polygon(circle)
+
+
 def test_halfplanes_have_unit_outward_normals_and_touch_their_edges():
     polygon = support_polygon(np.random.default_rng(3).normal(size=(12, 2)))
     A, b = polygon_halfplanes(polygon)
@@ -117,7 +138,9 @@ def test_com_margin_over_a_segment_a_point_or_nothing_is_never_positive():
     assert com_margin([0.5, 0.2], segment) == pytest.approx(-0.2)
     assert com_margin([1.3, 0.4], segment) == pytest.approx(-0.5)
     assert com_margin([3.0, 4.0], np.zeros((1, 2))) == pytest.approx(-5.0)
+    assert com_margin([3.0, 4.0], np.zeros((3, 2))) == pytest.approx(-5.0)
     assert com_margin([0.0, 0.0], np.zeros((0, 2))) == -math.inf
+    assert math.isnan(com_margin([math.nan, 0.0], SQUARE))
 
 
 # The support ellipse.

@@ -4,6 +4,10 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
+#include <cstddef>
+#include <initializer_list>
+
 namespace clamber {
 
 namespace nb = nanobind;
@@ -14,6 +18,18 @@ using Array1 = nb::ndarray<const T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 template <typename T = double>
 using Array2 = nb::ndarray<const T, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 
+// A NumPy array of its own, filled from `data`.
+template <typename T>
+nb::ndarray<nb::numpy, T> new_array(const T* data, std::initializer_list<std::size_t> shape) {
+    std::size_t size = 1;
+    for (const std::size_t s : shape) size *= s;
+    T* const copy = new T[size];
+    std::copy(data, data + size, copy);
+    nb::capsule owner(copy, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+    return {copy, shape, owner};
+}
+
+void bind_polygon(nb::module_& m);
 void bind_statics(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_servo(nb::module_& m);

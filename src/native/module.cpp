@@ -5,6 +5,7 @@
 
 NB_MODULE(_core, m) {
     m.doc() = "Native core: kinematics, distances, postures, paths, statics.";
+    clamber::bind_polygon(m);
     clamber::bind_statics(m);
     clamber::bind_geometry(m);
     clamber::bind_servo(m);

@@ -1,0 +1,25 @@
+"""Native core: inner loops of kinematics, distances, postures, paths, statics."""
+
+import numpy as np
+
+def support_polygon(points: np.ndarray) -> np.ndarray:
+    """(K, 2) convex hull of points (N, 2)."""
+
+def polygon_halfplanes(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A, b of half-planes `A p <= b` of a polygon (K, 2)."""
+
+def com_margin(x: float, y: float, polygon: np.ndarray) -> float:
+    """Signed distance to the border, positive inside."""
+
+def com_margins(com: np.ndarray, polygon: np.ndarray) -> np.ndarray:
+    """(n,) `com_margin` of many (n, 2)."""
+
+def support_ellipse(
+    polygon: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Centre (2,), semi-axes (2,), foci (2, 2) and string length."""
+
+def ellipse_excess(
+    foci: np.ndarray, string_length: float, x: float, y: float
+) -> tuple[float, np.ndarray]:
+    """Summed distance to the foci less the string length, and its gradient (2,)."""
