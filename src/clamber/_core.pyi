@@ -11,6 +11,11 @@ def polygon_halfplanes(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def com_margin(x: float, y: float, polygon: np.ndarray) -> float:
     """Signed distance to the border, positive inside."""
 
+def nearest_border(
+    x: float, y: float, polygon: np.ndarray
+) -> tuple[float, tuple[float, float]]:
+    """`com_margin`, and the unit direction that leads out the shortest way."""
+
 def com_margins(com: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     """(n,) `com_margin` of many (n, 2)."""
 

@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
+from clamber import _core
 from clamber.model.records import short_repr
-from clamber.step.polygon import nearest_border, support_polygon
+from clamber.step.polygon import support_polygon
 
 GRAVITY = 9.81  # [m/s^2]
 MAX_CONTACT_ANGLE = math.radians(25.0)  # found by experiment in the thesis
@@ -518,7 +519,7 @@ def _push_margin(lp: _PushLP) -> tuple[float, np.ndarray]:
             break
         found.append(push)
         polygon = support_polygon(np.array(found))
-        inner, out = nearest_border(0.0, 0.0, polygon.tolist())
+        inner, out = _core.nearest_border(0.0, 0.0, polygon)
     return max(-PUSH_LIMIT, min(PUSH_LIMIT, float(inner))), duals
 
 
