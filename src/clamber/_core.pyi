@@ -28,3 +28,24 @@ def ellipse_excess(
     foci: np.ndarray, string_length: float, x: float, y: float
 ) -> tuple[float, np.ndarray]:
     """Summed distance to the foci less the string length, and its gradient (2,)."""
+
+class Proximity:
+    """Which of many pairs of shapes are near, asked again and again as they move."""
+
+    def __init__(
+        self,
+        kinds: np.ndarray,
+        sizes: np.ndarray,
+        vertices: list[np.ndarray],
+        pairs: np.ndarray,
+    ) -> None:
+        """Kinds (n,) int32 and sizes (n, 3) of shapes, hull vertices of each (k, 3)."""
+
+    def query(
+        self,
+        xpos: np.ndarray,
+        xmat: np.ndarray,
+        reach: float,
+        active: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs (m,), distances (m,), normals, first and second points (m, 3)."""
