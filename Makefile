@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type bench pictures experiments docs build clean
+.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type sanitize fuzz bench pictures experiments docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -16,6 +16,14 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 # Whole files go to one worker, so that what they share is made once.
 PYTEST = -m pytest -n $(WORKERS) --dist loadfile
 OUTSIDE = docs or pool or browser
+# What the native core is compiled from; a folder's date tells that a file came or went.
+NATIVE := CMakeLists.txt $(shell find src/native -not -path 'src/native/fuzz*')
+NATIVE_TESTS = $(sort $(wildcard tests/test_native_*.py) $(wildcard $(addprefix tests/test_,geometry.py statics.py polygon.py)) \
+	$(shell grep -l 'mark\.native' tests/*.py))
+SANITIZED := build/sanitize
+# Without `site` (python -S) no folder's .pth brings in the package that make installed.
+SITE = $(shell $(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+PIP = -m pip install --quiet --disable-pip-version-check
 QUICK = not slow and not gpu and not network
 # One thread for each process: the matrices are small, and tests run side by side.
 export OMP_NUM_THREADS ?= 1
@@ -36,10 +44,9 @@ test-ci: $(VENV)/.has-video $(VENV)/.has-test ## what starts other programs: doc
 test-all: $(VENV)/.has-video $(VENV)/.has-test ## the slow tests too: whole climbs in physics
 	$(BIN)/python $(PYTEST) -m "not gpu and not network"
 
-test-mujoco3: | $(BIN)/python ## the tests of `make test` with the last MuJoCo 3, in an environment of their own
-	@[ -x $(VENV3)/bin/python ] || $(BIN)/python -m venv $(VENV3)
+test-mujoco3: $(VENV3)/.can-build ## the tests of `make test` with the last MuJoCo 3, in an environment of their own
 	@grep -v '^mujoco' constraints.txt > $(VENV3)/constraints.txt
-	@$(VENV3)/bin/python -m pip install --quiet --disable-pip-version-check \
+	@$(VENV3)/bin/python $(PIP) --no-build-isolation -C build-dir=build/mujoco3 \
 		-c $(VENV3)/constraints.txt 'mujoco<4' -e '.[video,test]'
 	$(VENV3)/bin/python $(PYTEST) -m "$(QUICK) and not ($(OUTSIDE)) and not compare"
 
@@ -53,6 +60,13 @@ lint: $(VENV)/.has-dev ## ruff: rules and format
 
 type: $(VENV)/.has-view $(VENV)/.has-video $(VENV)/.has-test $(VENV)/.has-dev ## pyright on src
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+sanitize: $(VENV)/.has-test ## the tests of the native core against one that stops at memory errors and undefined behaviour
+	@$(BIN)/python $(PIP) --no-build-isolation --no-deps --upgrade --target $(SANITIZED)/site \
+		-C build-dir=$(SANITIZED)/objects -C cmake.define.CLAMBER_SANITIZE=ON -C install.strip=false .
+	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
+		ASAN_OPTIONS=detect_leaks=0 PYTHONPATH=$(SANITIZED)/site:$(SITE) \
+		$(BIN)/python -S -m pytest -n 0 -m "$(QUICK)" $(NATIVE_TESTS)
 
 bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same jobs in other libraries
 	@for f in benchmarks/bench_*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
@@ -75,11 +89,11 @@ docs: $(VENV)/.has-docs ## the documentation as a web site, into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open site/index.html"
 
-build: $(VENV)/.has-dev ## wheel and sdist into dist/, tried out in an empty environment
+build: $(VENV)/.has-dev $(VENV)/.can-build ## wheel and sdist into dist/, tried out in an empty environment
 	rm -rf dist build/empty
-	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m build --no-isolation --outdir dist .
 	$(PYTHON) -m venv build/empty
-	build/empty/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	build/empty/bin/python $(PIP) -c constraints.txt dist/*.whl
 	cd build && ./empty/bin/clamber --version
 	cd build && ./empty/bin/python -c 'import clamber; clamber.load_demo("climb"); clamber.load_robot("coman")'
 	rm -rf build/empty
@@ -87,10 +101,31 @@ build: $(VENV)/.has-dev ## wheel and sdist into dist/, tried out in an empty env
 clean: ## remove what make has made, but no runs
 	rm -rf $(VENV) $(VENV3) build dist site .pytest_cache .ruff_cache
 
-# A stamp for each extra that is installed: nothing is fetched twice, so make works offline afterwards.
-$(VENV)/.has-%: pyproject.toml constraints.txt | $(BIN)/python
+# A stamp for each extra that is installed: nothing is fetched twice, so make works offline
+# afterwards. The package is there already, so pip only looks up what the extra asks for.
+$(VENV)/.has-%: pyproject.toml constraints.txt | $(VENV)/.has-core
 	@echo "installing clamber[$*] into $(VENV) ..."
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[$*]'
+	@$(BIN)/python $(PIP) -c constraints.txt 'clamber[$*]'
+	@touch $@
+
+# The package itself, from this folder. What was compiled stays in build/: after a change
+# only the files that changed are compiled again. The stamp bears the date of the beginning,
+# so that what is edited meanwhile counts as changed.
+$(VENV)/.has-core: pyproject.toml constraints.txt $(NATIVE) | $(VENV)/.can-build
+	@echo "compiling the native core ..."
+	@touch $@.begun
+	@$(BIN)/python $(PIP) --no-build-isolation -c constraints.txt -e .
+	@mv $@.begun $@
+
+# What compiles it: CMake and Ninja are the system's where it has them.
+%/.can-build: pyproject.toml constraints.txt | %/bin/python
+	@command -v "$${CXX:-c++}" g++ clang++ >/dev/null || { \
+		echo "clamber is compiled with a C++17 compiler and found none: apt-get install g++ (Debian, Ubuntu), or name one with make CXX=..." >&2; exit 1; }
+	@$*/bin/python -c 'import pathlib, sysconfig as s; (pathlib.Path(s.get_path("include")) / "Python.h").stat()' 2>/dev/null || { \
+		echo "$(PYTHON) has no headers to compile against: apt-get install python3-dev (Debian, Ubuntu), or name another with make PYTHON=..." >&2; exit 1; }
+	@$*/bin/python $(PIP) -c constraints.txt nanobind scikit-build-core
+	@needed=$$($*/bin/python -c 'import scikit_build_core.build as b; print(*b.get_requires_for_build_wheel())'); \
+		[ -z "$$needed" ] || $*/bin/python $(PIP) -c constraints.txt $$needed
 	@touch $@
 
 $(BIN)/python:
@@ -99,3 +134,6 @@ $(BIN)/python:
 	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 		echo "$(PYTHON) cannot make a virtual environment: install python3-venv (Debian, Ubuntu), or name another with make PYTHON=..." >&2; exit 1; }
 	@"$(PYTHON)" -m venv $(VENV)
+
+$(VENV3)/bin/python: | $(BIN)/python
+	@$(BIN)/python -m venv $(VENV3)
