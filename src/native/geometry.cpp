@@ -379,7 +379,7 @@ class Polytope {
                 while (face_[g].next[e] != seen[i]) ++e;
                 rim[n_rim++] = {g, e};
             }
-        if (n_rim != n_seen + 2) return false;
+        if (n_rim < 3 || n_rim > n_seen + 2) return false;
         v_[vertices_] = w;
         int starting[kVertices];  // the new face whose edge on the rim starts at a vertex
         std::fill(starting, starting + vertices_, -1);
@@ -393,6 +393,7 @@ class Polytope {
             starting[from] = f;
         }
         ++vertices_;
+        for (int i = n_rim; i < n_seen; ++i) face_[seen[i]].n = {}, face_[seen[i]].h = kInf;
         for (int i = 0; i < n_rim; ++i) {
             const int f = face_[rim[i].face].next[rim[i].edge], after = starting[face_[f].v[1]];
             if (after < 0) return false;

@@ -11,15 +11,23 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber import _core
+from clamber.errors import InputError
 from clamber.model.records import short_repr
 from clamber.model.se3 import rotation_vector
 from clamber.model.world import World, chain_up
 
-LOOK_RANGE = 0.12  # [m] to which distances are looked at, to know when to look again
-ROUNDING = 1e-6  # [m] by which squared distances may be wrong, near 0
-FEW_PAIRS = 40  # that are quicker looked at than bounded
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
-_ONES = np.ones(9)
+# The core's kinds of shape, in its order.
+SHAPES = (
+    mujoco.mjtGeom.mjGEOM_PLANE,
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_BOX,
+    mujoco.mjtGeom.mjGEOM_MESH,
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -42,15 +50,31 @@ class Proximity:
     __repr__ = short_repr
 
 
-def _nearer_than(near: Proximity, reach: float) -> Proximity:
-    keep = (near.distance < reach).nonzero()[0]
-    return Proximity(
-        pairs=near.pairs.take(keep),
-        distance=near.distance.take(keep),
-        normal=near.normal.take(keep, axis=0),
-        first=near.first.take(keep, axis=0),
-        second=near.second.take(keep, axis=0),
-    )
+def near_pairs(model: mujoco.MjModel, pairs: np.ndarray) -> _core.Proximity:
+    """A workspace that finds which pairs (P, 2) of a model's geoms are near."""
+    kinds = np.zeros(model.ngeom, dtype=np.int32)
+    vertices = [np.zeros((0, 3))] * model.ngeom
+    for g in np.unique(pairs):
+        kind = mujoco.mjtGeom(int(model.geom_type[g]))
+        if kind not in SHAPES:
+            known = [k.name for k in SHAPES]
+            raise InputError("a shape with distances", None, kind.name, known)
+        kinds[g] = SHAPES.index(kind)
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            vertices[g] = _hull(model, int(model.geom_dataid[g]))
+    pairs = np.ascontiguousarray(pairs, dtype=np.int32)
+    return _core.Proximity(kinds, model.geom_size, vertices, pairs)
+
+
+def _hull(model: mujoco.MjModel, mesh: int) -> np.ndarray:
+    """(k, 3) vertices of a mesh's convex hull, all of them where it has none."""
+    first = model.mesh_vertadr[mesh]
+    points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
+    at = int(model.mesh_graphadr[mesh])
+    if at < 0:
+        return points
+    n = int(model.mesh_graph[at])
+    return points[model.mesh_graph[at + 2 + n : at + 2 + 2 * n]]
 
 
 class Kinematics:
@@ -67,41 +91,13 @@ class Kinematics:
         self.data = mujoco.MjData(m)
         self._jacp = np.zeros((3, m.nv))
         self._jacr = np.zeros((3, m.nv))
-        self._fromto = np.zeros((len(world.pairs), 6))
-        self._fromto_rows = list(self._fromto)
-        self._pairs = world.pairs.tolist()
+        self._near = near_pairs(m, world.pairs)
         self._turn = np.zeros(3)
         # Views of the data: asking for them anew at each use costs more than the use.
         self._xpos = self.data.xpos
         self._xmat = self.data.xmat.reshape(-1, 3, 3)
         self._xquat = self.data.xquat
         self._com = self.data.subtree_com[world.base]
-        first, second = world.pairs.T
-        self._first, self._second = first, second
-        radius = m.geom_rbound.copy()
-        self._planes = np.flatnonzero(m.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-        box = m.geom_type == mujoco.mjtGeom.mjGEOM_BOX
-        self._boxes = np.flatnonzero(box & (m.body_weldid[m.geom_bodyid] == 0))
-        self._radius, self._spheres = radius, radius[:, None] + radius
-        self._size = m.geom_size.copy()
-        self._of_pair = first * m.ngeom + second
-        # No point moves farther by a turn than the radius times its matrix's 2-norm:
-        # the Frobenius norm over the root of two.
-        self._swing = radius / np.sqrt(2.0)
-        # What is known of each pair's distance, and where the geoms were then.
-        self._least = np.full(len(world.pairs), -np.inf)
-        self._seen = b"", b""
-        self._seen_x, self._seen_R = np.zeros((m.ngeom, 3)), np.zeros((m.ngeom, 9))
-        self._geom_x, self._geom_R = self.data.geom_xpos, self.data.geom_xmat
-        # What was asked for last, and the answer.
-        self._asked: tuple[float, np.ndarray | None] = (-np.inf, None)
-        self._near = Proximity(
-            pairs=np.zeros(0, dtype=int),
-            distance=np.zeros(0),
-            normal=np.zeros((0, 3)),
-            first=np.zeros((0, 3)),
-            second=np.zeros((0, 3)),
-        )
         # (nbody, nv): the dofs that move a body.
         self._moves = np.zeros((m.nbody, m.nv))
         for body in range(m.nbody):
@@ -211,89 +207,14 @@ class Kinematics:
         return rotation_vector(R_WC @ (self._xmat[s.body] @ s.rotation).T)
 
     def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
-        """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them.
-
-        The same array asks for the same pairs: it must not be written to meanwhile.
-        A pair is looked at only where neither its bounds nor its last distance, less
-        what its geoms have moved since, say that it is farther.
-        """
-        m, d = self.world.model, self.data
-        least, moved = self._least, self._moved()
-        if moved is None and active is self._asked[1] and reach <= self._asked[0]:
-            return _nearer_than(self._near, reach)
-        if moved is not None:
-            least -= moved
-        idx = self._nearer(reach, active)
-        if len(idx) > FEW_PAIRS:
-            np.maximum(least, self._gaps(), out=least)
-            idx = self._nearer(reach, active)
-        far = max(reach, LOOK_RANGE)
-        look, pairs = mujoco.mj_geomDistance, self._pairs
-        distance = np.array(
-            [
-                look(m, d, *pairs[i], far, row)
-                for i, row in zip(idx.tolist(), self._fromto_rows, strict=False)
-            ]
+        """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them."""
+        d = self.data
+        pairs, distance, normal, first, second = self._near.query(
+            d.geom_xpos, d.geom_xmat, reach, active
         )
-        least.put(idx, distance)
-        keep = (distance < reach).nonzero()[0]
-        # `take` is four times as fast as an index array.
-        distance, idx = distance.take(keep), idx.take(keep)
-        p = self._fromto.take(keep, axis=0)
-        apart, touching = distance[:, None], (np.abs(distance) < 1e-9).nonzero()[0]
-        if len(touching):
-            apart = apart.copy()
-            apart[touching] = 1.0
-        normal = (p[:, 3:] - p[:, :3]) / apart
-        for i in touching:
-            normal[i] = self._touching_normal(idx[i])
-        self._asked = reach, active
-        self._near = Proximity(
-            pairs=idx,
-            distance=distance,
-            normal=normal,
-            first=p[:, :3],
-            second=p[:, 3:],
+        return Proximity(
+            pairs=pairs, distance=distance, normal=normal, first=first, second=second
         )
-        return self._near
-
-    def _nearer(self, reach: float, active: np.ndarray | None) -> np.ndarray:
-        """Indices of the pairs that may be nearer than `reach` [m]."""
-        near = self._least < reach
-        if active is not None:
-            near &= active
-        return near.nonzero()[0]
-
-    def _gaps(self) -> np.ndarray:
-        """(P,) what bounding spheres, planes and boxes say that is between pairs."""
-        x = self._geom_x - self._root
-        square = (x * x) @ _ONES[:3]
-        gap = square[:, None] + square - 2.0 * (x @ x.T)
-        gap = np.sqrt(np.maximum(gap, 0.0)) - ROUNDING - self._spheres
-        for plane in self._planes:
-            gap[plane] = gap[:, plane] = x[:, 2] - x[plane, 2] - self._radius
-        for box in self._boxes:
-            R = self._geom_R[box].reshape(3, 3)
-            outside = np.abs((x - x[box]) @ R) - self._size[box]
-            outside = np.maximum(outside, 0.0) ** 2
-            away = np.sqrt(outside @ _ONES[:3]) - self._radius
-            gap[box] = gap[:, box] = away
-        return gap.take(self._of_pair)
-
-    def _moved(self) -> np.ndarray | None:
-        """(P,) the most that pairs can have come nearer since this was last asked.
-
-        None where nothing has moved.
-        """
-        seen = self._geom_x.tobytes(), self._geom_R.tobytes()
-        if seen == self._seen:
-            return None
-        self._seen = seen
-        x, R = self._geom_x - self._seen_x, self._geom_R - self._seen_R
-        way = np.sqrt((x * x) @ _ONES[:3]) + 1e-9
-        way += self._swing * np.sqrt((R * R) @ _ONES)
-        self._seen_x[:], self._seen_R[:] = self._geom_x, self._geom_R
-        return way.take(self._first) + way.take(self._second)
 
     def distance_jacobian(
         self, pairs: np.ndarray, points: np.ndarray, normals: np.ndarray
@@ -311,17 +232,6 @@ class Kinematics:
         arm = points - self._root
         wrench = np.concatenate([_cross(arm, normals), normals], axis=1)
         return (wrench @ self._cdof.T) * self._pair_moves.take(pairs, axis=0)
-
-    def _touching_normal(self, pair: int) -> np.ndarray:
-        """(3,) from the first geom to the second where their distance is zero."""
-        a, b = self._first[pair], self._second[pair]
-        x, R = self.data.geom_xpos, self.data.geom_xmat
-        if a in self._planes:
-            return R[a].reshape(3, 3)[:, 2]
-        if b in self._planes:
-            return -R[b].reshape(3, 3)[:, 2]
-        n = x[b] - x[a]
-        return n / np.linalg.norm(n)
 
     def integrate(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """(nq,) `q` moved along the tangent vector `v` (nv,) for unit time."""
