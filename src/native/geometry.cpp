@@ -12,15 +12,19 @@ namespace {
 
 constexpr double kInf = std::numeric_limits<double>::infinity();
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
-// Cores nearer than this share of their size have no direction from one to the other.
-constexpr double kTouch = 1e-10;
+// Cores nearer than this share of their size have no direction from one to the other; on
+// curved ones GJK finds it only to the root of rounding.
+constexpr double kTouch = 1e-10, kTouchCurved = 1e-7;
 constexpr double kGap = 1e-13;  // share of the size by which a distance may be wrong
-constexpr double kFlat = 1e-26;  // squared sine of an angle that rounding may have made
+constexpr double kRounding = 1e-15;  // of vertices, as a share of the size
 constexpr int kIterations = 100;
 constexpr int kVertices = 200, kFaces = 2 * kVertices;
 
 bool is_round(const Shape& s) {
     return s.kind == ShapeKind::Sphere || s.kind == ShapeKind::Capsule;
+}
+bool is_curved(const Shape& s) {
+    return s.kind == ShapeKind::Ellipsoid || s.kind == ShapeKind::Cylinder;
 }
 double radius(const Shape& s) { return is_round(s) ? s.size.x : 0.0; }
 // From the middle of a round shape's core to its end.
@@ -202,8 +206,9 @@ void nearest_on(const Vec3& a, const Vec3& b, const Vec3& c, double* weight) {
 }
 
 // Weights of the simplex's point that is nearest to the origin; vertices without a weight
-// go. False where the origin is inside.
-bool reduce(Simplex& s) {
+// go. False where the origin is inside. No face has an inner side where rounding
+// may have made it.
+bool reduce(Simplex& s, double scale) {
     if (s.n == 2) nearest_on(s.v[0].w, s.v[1].w, s.weight);
     if (s.n == 3) nearest_on(s.v[0].w, s.v[1].w, s.v[2].w, s.weight);
     if (s.n == 4) {
@@ -211,10 +216,11 @@ bool reduce(Simplex& s) {
         double least = kInf, best[4] = {0, 0, 0, 0};
         for (const auto& f : faces) {
             const Vec3 &a = s.v[f[0]].w, &b = s.v[f[1]].w, &c = s.v[f[2]].w;
-            const Vec3 n = cross(b - a, c - a), e = s.v[f[3]].w - a;
-            const double height = dot(n, e);
-            const bool flat = height * height <= kFlat * square(n) * square(e);
-            if (!flat && height * -dot(n, a) > 0) continue;  // on the inner side
+            const Vec3 ab = b - a, ac = c - a, ad = s.v[f[3]].w - a, n = cross(ab, ac);
+            const double inner = dot(n, ad), origin = -dot(n, a);
+            const double rounding = kRounding * scale * (square(ab) + square(ac) + square(ad));
+            if (inner * origin > 0 && std::min(std::abs(inner), std::abs(origin)) > rounding)
+                continue;
             double weight[3];
             nearest_on(a, b, c, weight);
             const double d = square(weight[0] * a + weight[1] * b + weight[2] * c);
@@ -241,16 +247,17 @@ bool gjk(const Pair& pair, Simplex& s, double& scale) {
     s.v[0] = support(pair, -v);
     s.n = 1;
     v = s.v[0].w;
+    const double touch = is_curved(pair.a) || is_curved(pair.b) ? kTouchCurved : kTouch;
     scale = norm(v);
     for (int i = 0; i < kIterations; ++i) {
         const double vv = square(v), away = std::sqrt(vv);
-        if (!(away > kTouch * scale)) return false;
+        if (!(away > touch * scale)) return false;
         const Vertex next = support(pair, -v);
         scale = std::max(scale, norm(next.w));
         if (vv - dot(v, next.w) <= kGap * scale * away) return true;
         Simplex grown = s;
         grown.v[grown.n++] = next;
-        if (!reduce(grown)) return false;
+        if (!reduce(grown, scale)) return false;
         const Vec3 nearer = grown.at<&Vertex::w>();
         if (!(square(nearer) < vv)) return true;  // as near as rounding lets
         s = grown;

@@ -15,7 +15,7 @@ namespace clamber {
 namespace {
 
 constexpr double kInf = std::numeric_limits<double>::infinity();
-constexpr double kSlack = 1e-7;  // [m] by which distances and what is subtracted may be wrong
+constexpr double kSlack = 1e-6;  // [m] by which distances and what is subtracted may be wrong
 constexpr double kRounding = 1e-13;
 
 // From a sphere's centre to a box.
