@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type sanitize fuzz bench pictures experiments docs build clean
+.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type sanitize sanitized fuzz bench pictures experiments docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,6 +23,7 @@ NATIVE_TESTS = $(sort $(wildcard tests/test_native_*.py) $(wildcard $(addprefix 
 SANITIZED := build/sanitize
 # Without `site` (python -S) no folder's .pth brings in the package that make installed.
 SITE = $(shell $(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
+N ?= 20000
 PIP = -m pip install --quiet --disable-pip-version-check
 QUICK = not slow and not gpu and not network
 # One thread for each process: the matrices are small, and tests run side by side.
@@ -61,12 +62,18 @@ lint: $(VENV)/.has-dev ## ruff: rules and format
 type: $(VENV)/.has-view $(VENV)/.has-video $(VENV)/.has-test $(VENV)/.has-dev ## pyright on src
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-sanitize: $(VENV)/.has-test ## the tests of the native core against one that stops at memory errors and undefined behaviour
-	@$(BIN)/python $(PIP) --no-build-isolation --no-deps --upgrade --target $(SANITIZED)/site \
-		-C build-dir=$(SANITIZED)/objects -C cmake.define.CLAMBER_SANITIZE=ON -C install.strip=false .
+sanitize: $(VENV)/.has-test sanitized ## tests of the native core against one that stops at memory errors and undefined behaviour
 	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
 		ASAN_OPTIONS=detect_leaks=0 PYTHONPATH=$(SANITIZED)/site:$(SITE) \
 		$(BIN)/python -S -m pytest -n 0 -m "$(QUICK)" $(NATIVE_TESTS)
+
+fuzz: sanitized ## N random and degenerate problems for each part of that core
+	ASAN_OPTIONS=detect_leaks=0 $(SANITIZED)/objects/fuzz $(N)
+
+sanitized: $(VENV)/.can-build
+	@echo "compiling the native core with sanitizers ..."
+	@$(BIN)/python $(PIP) --no-build-isolation --no-deps --upgrade --target $(SANITIZED)/site \
+		-C build-dir=$(SANITIZED)/objects -C cmake.define.CLAMBER_SANITIZE=ON -C install.strip=false .
 
 bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same jobs in other libraries
 	@for f in benchmarks/bench_*.py; do echo "== $$f"; $(BIN)/python "$$f"; done

@@ -178,7 +178,8 @@ Ellipse support_ellipse(const Polygon& polygon) {
         yy += cross * (a[1] * a[1] + b[1] * b[1] + sy * sy);
     }
     area *= 0.5;
-    if (area <= 1e-12 * square) {
+    // What is slimmer has a second moment across it that rounding may make negative.
+    if (area <= 1e-6 * square) {
         const double* half = r[0];
         for (int i = 1; i < n; ++i)
             if (r[i][0] * r[i][0] + r[i][1] * r[i][1] > half[0] * half[0] + half[1] * half[1])
