@@ -197,6 +197,17 @@ def test_the_ellipse_of_a_triangle_touches_the_middles_of_its_sides():
         assert ellipse.excess(middle)[0] == pytest.approx(0.0, abs=1e-12)
 
 
+def test_points_that_rounding_takes_off_their_line_have_an_ellipse_without_width():
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        x = rng.uniform(-1, 1, size=8)
+        polygon = support_polygon(np.column_stack([x, 0.3 * x]))
+        assert len(polygon) > 1
+        longer, shorter = support_ellipse(polygon).semi_axes
+        assert longer == pytest.approx(0.5 * math.hypot(1.0, 0.3) * np.ptp(x), rel=1e-6)
+        assert 0.0 <= shorter < 1e-3
+
+
 def test_the_ellipse_has_the_axes_of_the_second_moments_of_area():
     rng = np.random.default_rng(19)
     polygon = support_polygon(rng.normal(size=(7, 2)) * [1.0, 0.4])

@@ -180,11 +180,18 @@ Ellipse support_ellipse(const Polygon& polygon) {
     area *= 0.5;
     // What is slimmer has a second moment across it that rounding may make negative.
     if (area <= 1e-6 * square) {
-        const double* half = r[0];
-        for (int i = 1; i < n; ++i)
-            if (r[i][0] * r[i][0] + r[i][1] * r[i][1] > half[0] * half[0] + half[1] * half[1])
-                half = r[i];
-        return ellipse_of(mx, my, length_of(half[0], half[1]), 0.0, half[0], half[1]);
+        // From the vertex farthest from the middle to the one farthest from that.
+        double end[2][2] = {};
+        for (auto& e : end) {
+            const double from[2] = {end[0][0], end[0][1]};
+            double most = -1.0;
+            for (int i = 0; i < n; ++i) {
+                const double d = length_of(r[i][0] - from[0], r[i][1] - from[1]);
+                if (d > most) most = d, e[0] = r[i][0], e[1] = r[i][1];
+            }
+        }
+        const double hx = 0.5 * (end[0][0] - end[1][0]), hy = 0.5 * (end[0][1] - end[1][1]);
+        return ellipse_of(mx + end[1][0] + hx, my + end[1][1] + hy, length_of(hx, hy), 0.0, hx, hy);
     }
     cx /= 6 * area;
     cy /= 6 * area;
