@@ -24,6 +24,7 @@ from clamber.step.polygon import (
 from clamber.step.statics import (
     ContactPoints,
     Load,
+    TorqueLimits,
     contact_forces,
     is_statically_stable,
     static_equilibrium,
@@ -42,6 +43,18 @@ def random_stance(rng: np.random.Generator) -> tuple[ContactPoints, np.ndarray]:
     com = np.append(points[:, :2].mean(axis=0) + rng.normal(0.0, 0.08, 2), 0.5)
     mu, names = rng.uniform(0.2, 1.0, nc), [""] * nc
     return ContactPoints(points=points, normals=normals, mu=mu, names=names), com
+
+
+def random_torque(rng: np.random.Generator, contacts: ContactPoints) -> TorqueLimits:
+    """Of a humanoid with 29 joints, a few of them weak."""
+    rows = 3 * len(contacts.points)
+    return TorqueLimits(
+        jacobian=rng.normal(0.0, 0.3, (rows, 35)),
+        gravity=rng.normal(0.0, 10.0, 35),
+        dofs=np.arange(6, 35, dtype=np.intc),
+        limits=rng.uniform(20.0, 150.0, 29),
+        names=[str(j) for j in range(29)],
+    )
 
 
 def timed(job: Callable, inputs: Sequence) -> tuple[float, list]:
@@ -83,6 +96,10 @@ def main() -> None:
     print(f"contact_forces:            {us:8.1f} us")
     us, _ = timed(lambda s: static_equilibrium(*s), loads[:100])
     print(f"static_equilibrium:        {us:8.1f} us")
+    jointed = [(*s, random_torque(rng, s[0])) for s in loads]
+    for job in (contact_forces, static_equilibrium):
+        us, _ = timed(lambda s, job=job: job(*s[:2], torque=s[2]), jointed)
+        print(f"{job.__name__ + ', torques:':27}{us:8.1f} us")
     clouds = [rng.uniform(-0.4, 0.4, (16, 2)) for _ in range(STANCES)]
     us, polygons = timed(support_polygon, clouds)
     print(f"support_polygon, 16 points: {us:7.1f} us")

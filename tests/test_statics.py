@@ -5,17 +5,16 @@ import math
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import qpsolvers
 from scipy.optimize import linprog
 
 from clamber.model.se3 import matrix_from_rpy
-from clamber.step.polygon import (
-    com_margin,
-    support_polygon,
-)
+from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.statics import (
     BALANCE_TOL,
     GRAVITY,
@@ -76,14 +75,40 @@ def least_forces(contacts: ContactPoints, com, torque=None) -> ContactForces:
     return contact_forces(contacts, load, torque=torque)
 
 
-def lp_holds(c: ContactPoints, com, weight=(0.0, 0.0, 1.0)) -> bool:
+def random_torque(
+    rng: np.random.Generator, contacts: ContactPoints, com: np.ndarray
+) -> TorqueLimits:
+    """Of a robot of `MASS` with five joints, in any direction, some of them weak."""
+    J = rng.normal(size=(3 * len(contacts.points), 11)) * 0.3
+    for i, p in enumerate(contacts.points):
+        J[3 * i : 3 * i + 3, :6] = np.c_[np.eye(3), np.cross(np.eye(3), p - com).T]
+    return TorqueLimits(
+        jacobian=J,
+        gravity=np.r_[0.0, 0.0, WEIGHT, 0.0, 0.0, 0.0, rng.normal(0.0, 10.0, 5)],
+        dofs=np.arange(6, 11),
+        limits=rng.uniform(5.0, 80.0, 5),
+        names=[f"joint {j}" for j in range(5)],
+    )
+
+
+def lp_holds(
+    c: ContactPoints, com, weight=(0.0, 0.0, 1.0), torque: TorqueLimits | None = None
+) -> bool:
     """The defining LP, written out contact by contact, solved by HiGHS."""
-    columns = []
+    columns, loads = [], []
     cones = cone_generators(c.normals, c.mu, c.cone_edges)
-    for p, edges in zip(c.points, cones, strict=True):
+    for i, (p, edges) in enumerate(zip(c.points, cones, strict=True)):
         columns += [np.append(e, np.cross(p - com, e)) for e in edges]
+        if torque is not None:
+            J = torque.jacobian[3 * i : 3 * i + 3, torque.dofs]
+            loads += [J.T @ e for e in edges]
     A, b = np.array(columns).T, [*weight, 0.0, 0.0, 0.0]
-    return linprog(np.zeros(A.shape[1]), A_eq=A, b_eq=b, method="highs").status == 0
+    A_ub = b_ub = None
+    if torque is not None:
+        T, g = np.array(loads).T, torque.gravity[torque.dofs]
+        A_ub = np.r_[T, -T] * WEIGHT
+        b_ub = np.r_[g + torque.limits, torque.limits - g]
+    return linprog(np.zeros(A.shape[1]), A_ub, b_ub, A, b).status == 0
 
 
 # The geometric measure.
@@ -271,7 +296,8 @@ def test_the_sign_of_the_margin_is_the_quick_verdict():
         assert verdict.feasible == is_statically_stable(contacts, com)
 
 
-def test_the_margin_is_the_least_push_over_all_directions():
+@pytest.mark.parametrize("jointed", [False, True])
+def test_the_margin_is_the_least_push_over_all_directions(jointed):
     """Pushes just within the margin hold in every direction, one beyond it does not."""
     rng = np.random.default_rng(14)
     angles = np.linspace(0, 2 * math.pi, 180)
@@ -279,13 +305,16 @@ def test_the_margin_is_the_least_push_over_all_directions():
     checked = 0
     while checked < 5:
         contacts, com = random_stance(rng)
-        margin = judged(contacts, com).margin
+        torque = random_torque(rng, contacts, com) if jointed else None
+        margin = judged(contacts, com, torque).margin
         if not 0.01 < margin < 0.9:
             continue
+        if torque is not None and margin > judged(contacts, com).margin - 1e-3:
+            continue  # no joint limits it
         checked += 1
 
-        def holds(push, stance=(contacts, com)):
-            return lp_holds(*stance, (*-push, 1.0))
+        def holds(push, contacts=contacts, com=com, torque=torque):
+            return lp_holds(contacts, com, (*-push, 1.0), torque)
 
         assert all(holds(0.999 * margin * u) for u in ring)
         assert not all(holds(1.02 * margin * u) for u in ring)
@@ -358,6 +387,18 @@ def test_what_limits_is_what_had_to_pull_or_turns_or_nothing():
     assert verdict.limiting is None
 
 
+def test_of_contacts_that_yield_alike_the_first_limits():
+    """Both feet slide as one, whatever the last bits of their duals say."""
+    apart = np.array([0.0, 0.3])
+    for first, second in (("left", "right"), ("right", "left")):
+        feet = flat(
+            np.r_[SQUARE + apart, SQUARE - apart], 0.1, *[first] * 4, *[second] * 4
+        )
+        verdict = judged(feet, [0.0, 0.0, 0.1])
+        assert verdict.margin == pytest.approx(0.1 / math.sqrt(2), abs=1e-5)
+        assert verdict.limiting == first
+
+
 # Contact forces.
 
 
@@ -394,6 +435,68 @@ def test_contact_forces_are_the_least_of_those_that_balance():
     expected = S * (np.linalg.pinv(G * S) @ [0, 0, WEIGHT, 0, 0, 0])
     held = least_forces(stance, com)
     np.testing.assert_allclose(held.forces.ravel(), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("edges", [4, 7])
+def test_contact_forces_are_those_of_the_program_written_out(edges):
+    """With what is left over as variables, bound to the forces by equations."""
+    rng = np.random.default_rng(21)
+    for _ in range(20):
+        c, com = random_stance(rng)
+        c = replace(c, cone_edges=edges)
+        torque, price = random_torque(rng, c, com), rng.uniform(0.5, 2.0, len(c.mu))
+        load = Load(com=com, mass=MASS)
+        held = contact_forces(c, load, torque=torque, price=price)
+        nf, ns = 3 * len(c.mu), 11
+        n = nf + ns  # forces in the world [weights], wrench left, torques left
+        H = np.diag(np.r_[np.zeros(nf), np.full(ns, 1e8)])
+        facets = np.zeros((edges * len(c.mu), n))
+        balance = np.zeros((6, n))
+        for i, (p, normal) in enumerate(zip(c.points, c.normals, strict=True)):
+            at = slice(3 * i, 3 * i + 3)
+            H[at, at] = price[i] * (4.0 * np.eye(3) - 3.0 * np.outer(normal, normal))
+            balance[:, at] = np.r_[np.eye(3), np.cross(p - com, np.eye(3)).T]
+            cone = cone_generators(normal[None], c.mu[i : i + 1], edges)[0]
+            between = np.cross(np.roll(cone, -1, axis=0), cone)
+            facets[i * edges : (i + 1) * edges, at] = between
+        balance[:, nf : nf + 6] = np.eye(6)
+        turns = np.zeros((5, n))
+        turns[:, :nf] = torque.jacobian[:, torque.dofs].T
+        turns[:, nf + 6 :] = np.eye(5)
+        g = torque.gravity[torque.dofs]
+        bounds = np.r_[g + torque.limits, torque.limits - g] / WEIGHT
+        found = qpsolvers.solve_qp(
+            H,
+            np.zeros(n),
+            np.r_[facets, turns, -turns],
+            np.r_[np.zeros(len(facets)), bounds],
+            balance,
+            np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]),
+            solver="daqp",
+        )
+        assert found is not None
+        np.testing.assert_allclose(
+            held.forces.ravel(), WEIGHT * found[:nf], atol=3e-5 * WEIGHT
+        )
+        left = np.linalg.norm(found[nf:])
+        assert held.residual == pytest.approx(left, abs=3e-6)
+
+
+def test_what_was_solved_before_or_beside_changes_no_bit():
+    rng = np.random.default_rng(22)
+    cases = []
+    for _ in range(30):
+        c, com = random_stance(rng)
+        cases.append((c, com, random_torque(rng, c, com)))
+
+    def solved(case):
+        verdict = judged(*case)
+        return verdict.margin, verdict.limiting, verdict.forces.tobytes()
+
+    alone = [solved(case) for case in cases]
+    assert [solved(case) for case in cases[::-1]] == alone[::-1]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(solved, cases)) == alone
 
 
 def test_contact_forces_are_continuous_also_where_the_stance_stops_to_hold():
@@ -499,6 +602,71 @@ def test_torque_limits_lower_the_margin_and_name_the_weak_joint():
         assert verdict(*limits).limiting == weak
 
 
+def test_a_joint_that_no_contact_loads_limits_where_its_own_limb_is_too_heavy():
+    feet, torque = a_frame(1e3, 0.5, twice=True)
+    raised = replace(
+        torque,
+        jacobian=np.c_[torque.jacobian, np.zeros(12)],
+        gravity=np.append(torque.gravity, 20.0),
+        dofs=np.array([6, 7, 8]),
+        limits=np.array([1e3, 1e3, 19.0]),
+        names=(*torque.names, "shoulder"),
+    )
+    verdict = judged(feet, np.zeros(3), raised)
+    assert (verdict.feasible, verdict.margin) == (False, -1.0)
+    assert verdict.limiting == "shoulder"
+    held = least_forces(feet, np.zeros(3), raised)
+    assert held.residual == pytest.approx(1.0 / WEIGHT, rel=1e-3)
+    enough = replace(raised, limits=np.array([1e3, 1e3, 21.0]))
+    assert judged(feet, np.zeros(3), enough).feasible
+
+
+# What is no stance.
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_stance_that_is_no_number_does_not_hold(bad):
+    feet, torque = a_frame(1e3, 0.5, twice=True)
+    points, jacobian = feet.points.copy(), torque.jacobian.copy()
+    points[1, 2] = jacobian[4, 6] = bad
+    for c, com, t in (
+        (replace(feet, points=points), np.zeros(3), torque),
+        (replace(feet, normals=points), np.zeros(3), torque),
+        (feet, np.array([0.0, bad, 0.0]), torque),
+        (feet, np.zeros(3), replace(torque, jacobian=jacobian)),
+        (feet, np.zeros(3), replace(torque, gravity=np.full(8, math.nan))),
+    ):
+        with np.errstate(invalid="ignore"):
+            verdict = judged(c, com, t)
+        assert (verdict.feasible, verdict.margin) == (False, -1.0)
+        assert not np.any(verdict.forces)
+        assert least_forces(c, com, t).residual == 1.0
+    assert not is_statically_stable(replace(feet, points=points), np.zeros(3))
+
+
+def test_coincident_points_bear_as_one():
+    one = flat(np.zeros((1, 2)), 0.5)
+    eight = flat(np.zeros((8, 2)), 0.5)
+    for x in (0.0, 0.05):
+        com = [x, 0.0, 0.5]
+        margin = judged(one, com).margin
+        assert judged(eight, com).margin == pytest.approx(margin, abs=1e-6)
+        total = least_forces(eight, com).forces.sum(axis=0)
+        np.testing.assert_allclose(
+            total, least_forces(one, com).forces.sum(axis=0), atol=1e-4 * WEIGHT
+        )
+
+
+def test_joints_without_strength_hold_nothing_and_ice_holds_what_is_upright():
+    feet, torque = a_frame(0.0, 0.1, twice=True)
+    verdict = judged(feet, np.zeros(3), torque)
+    assert not verdict.feasible
+    assert verdict.limiting in torque.names
+    ice = flat(SQUARE, 1e-12)
+    assert judged(ice, [0.05, 0.0, 0.5]).margin == pytest.approx(0.0, abs=1e-6)
+    assert least_forces(ice, [0.05, 0.0, 0.5]).residual <= BALANCE_TOL
+
+
 def test_the_strength_that_is_needed_is_that_computed_by_hand():
     """Upright forces on ice, and none that friction would turn inwards: a m g / 2."""
     needed, load = A_LEG * WEIGHT / 2, Load(com=np.zeros(3), mass=MASS)
@@ -540,6 +708,13 @@ def test_records_of_the_wrong_shape_are_refused():
             replace(good, **{field: value})
     with pytest.raises(ValueError, match="2 points"):
         replace(feet, mu=np.ones(3))
+    com = np.zeros(3)
+    with pytest.raises(ValueError, match="three edges"):
+        judged(replace(feet, cone_edges=2), com)
+    with pytest.raises(ValueError, match="dofs"):
+        judged(feet, com, replace(good, dofs=np.array([6, 8])))
+    with pytest.raises(ValueError, match="jacobian's rows"):
+        judged(flat(SQUARE, 0.5), com, good)
 
 
 # Against another library.

@@ -270,11 +270,6 @@ void bind_polygon(nb::module_& m) {
     m.def("com_margin", [](double x, double y, const Points& vertices) {
         return com_margin(x, y, polygon_of(vertices));
     });
-    m.def("nearest_border", [](double x, double y, const Points& vertices) {
-        double outward[2];
-        const double d = nearest_border(x, y, polygon_of(vertices), outward);
-        return nb::make_tuple(d, nb::make_tuple(outward[0], outward[1]));
-    });
     m.def("com_margins", [](const Points& coms, const Points& vertices) {
         const Polygon polygon = polygon_of(vertices);
         std::vector<double> out;

@@ -6,7 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <vector>
+#include <memory>
 
 #include "daqp/include/api.h"
 #include "daqp/include/utils.h"
@@ -89,6 +89,13 @@ private:
         return sum[0] + sum[1] + sum[2] + sum[3] == 0.0;
     }
 
+    template <typename T>
+    static void reserve(std::unique_ptr<T[]>& array, std::size_t& room, std::size_t size) {
+        if (room >= size) return;
+        array.reset(new T[size]);
+        room = size;
+    }
+
     // Lays the workspace out for the problem; false where its numbers are no numbers.
     bool lay_out(const QP& qp) {
         qp_ = qp;
@@ -101,9 +108,9 @@ private:
 
         const std::size_t size = 5 * active + active * (active + 1) / 2 + 4 * n +
                                  n * (n + 1) / 2 + rows * (n + 1) + 8 * m;
-        if (numbers_.size() < size) numbers_.resize(size);
-        if (whole_.size() < active + n + m) whole_.resize(active + n + m);
-        double* next = numbers_.data();
+        reserve(numbers_, room_for_numbers_, size);
+        reserve(whole_, room_for_whole_, active + n + m);
+        double* next = numbers_.get();
         const auto take = [&next](std::size_t count) {
             double* const out = next;
             next += count;
@@ -132,7 +139,7 @@ private:
         work_.scaling = take(m);
         work_.dupper = take(m);
         work_.dlower = take(m);
-        work_.WS = whole_.data();
+        work_.WS = whole_.get();
         work_.prox_mask = work_.WS + active;
         work_.sense = work_.prox_mask + n;
         work_.outer_iter = 1;
@@ -187,8 +194,9 @@ private:
     DAQPProblem problem_{};
     DAQPWorkspace work_{};
     double *x_ = nullptr, *lam_ = nullptr;
-    std::vector<double> numbers_;
-    std::vector<int> whole_;
+    std::unique_ptr<double[]> numbers_;
+    std::unique_ptr<int[]> whole_;
+    std::size_t room_for_numbers_ = 0, room_for_whole_ = 0;
 };
 
 }  // namespace clamber

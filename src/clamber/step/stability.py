@@ -82,19 +82,19 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
 
 def contact_points(kin: Kinematics, contacts: Sequence[Contact]) -> ContactPoints:
     """The points of contacts that bear force, at the present posture."""
-    names, points, normals, mu = [], [], [], []
-    for c in contacts:
-        support = kin.world.supports[c.support]
-        p = kin.bearing_points(c.surface, support.normal, c.edge)
-        names += [c.surface] * len(p)
-        points.append(p)
-        normals.append(np.tile(support.normal, (len(p), 1)))
-        mu += [support.friction] * len(p)
+    supports = [kin.world.supports[c.support] for c in contacts]
+    points = [
+        kin.bearing_points(c.surface, support.normal, c.edge)
+        for c, support in zip(contacts, supports, strict=True)
+    ]
+    counts = [len(p) for p in points]
     return ContactPoints(
         points=np.concatenate(points),
-        normals=np.concatenate(normals),
-        mu=np.array(mu),
-        names=names,
+        normals=np.repeat([s.normal for s in supports], counts, axis=0),
+        mu=np.repeat([s.friction for s in supports], counts),
+        names=[
+            c.surface for c, n in zip(contacts, counts, strict=True) for _ in range(n)
+        ],
     )
 
 
@@ -159,13 +159,10 @@ def holding_limits(world: World, bearing: np.ndarray) -> np.ndarray:
 
 def point_jacobians(kin: Kinematics, points: ContactPoints) -> np.ndarray:
     """(3 nc, nv) of contact points, stacked, at the present posture."""
-    bodies = [kin.world.surfaces[n].body for n in points.names]
-    return np.concatenate(
-        [
-            kin.point_jacobian(body, p).copy()
-            for body, p in zip(bodies, points.points, strict=True)
-        ]
-    )
+    J = np.empty((3 * len(points.names), kin.world.model.nv))
+    for i, (name, p) in enumerate(zip(points.names, points.points, strict=True)):
+        kin.point_jacobian(kin.world.surfaces[name].body, p, J[3 * i : 3 * i + 3])
+    return J
 
 
 def torque_limits(kin: Kinematics, points: ContactPoints) -> TorqueLimits:
