@@ -94,15 +94,24 @@ class Answer:
     second: np.ndarray
 
 
-def asked(a: Placed, b: Placed) -> Answer:
+def workspace(a: Placed, b: Placed):
+    """`question(reach, a)` answers about the pair, `a` having moved."""
     near = _core.Proximity(
         np.array([a.kind, b.kind], dtype=np.int32),
         np.array([a.size, b.size]),
         [a.vertices, b.vertices],
         np.array([[0, 1]], dtype=np.int32),
     )
-    xmat = np.array([a.R.ravel(), b.R.ravel()])
-    pairs, distance, *rest = near.query(np.array([a.p, b.p]), xmat, np.inf)
+
+    def question(reach: float, a: Placed = a):
+        xmat = np.array([a.R.ravel(), b.R.ravel()])
+        return near.query(np.array([a.p, b.p]), xmat, reach)
+
+    return question
+
+
+def asked(a: Placed, b: Placed) -> Answer:
+    pairs, distance, *rest = workspace(a, b)(np.inf)
     assert len(pairs) == 1
     return Answer(float(distance[0]), *(x[0] for x in rest))
 
@@ -234,10 +243,11 @@ def test_nearest_points_belong_to_both_boxes(deep, rng):
     for k in range(100):
         turn = Rotation.random(random_state=rng).as_rotvec()
         one = placed(BOX, rng.uniform(0.05, 0.2, 3), (0.3, 0.2, 0.1), turn)
-        yaw = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-3, 3) if k % 2 else 0.0])
+        yaw = Rotation.from_rotvec([0.0, 0.0, 0.1 if k % 2 else 0.0])
         other = placed(BOX, rng.uniform(0.05, 0.2, 3))
         high = one.size[2] + other.size[2] + (-0.01 if deep else 0.01)
-        local = np.append(rng.uniform(-0.1, 0.1, 2), high)
+        beside = 0.9 * rng.uniform(-1.0, 1.0, 2) * (one.size + other.size)[:2]
+        local = np.append(beside, high)
         other = replace(other, p=one.p + one.R @ local, R=one.R @ yaw.as_matrix())
         x = assert_sound(one, other)
         for s, point in ((one, x.first), (other, x.second)):
@@ -362,14 +372,7 @@ def test_a_pose_that_is_no_number_has_no_distance(a, b, value, rng):
 
 
 def test_planes_never_meet():
-    near = _core.Proximity(
-        np.zeros(2, dtype=np.int32),
-        np.zeros((2, 3)),
-        [np.zeros((0, 3))] * 2,
-        np.array([[0, 1]], dtype=np.int32),
-    )
-    xmat = np.tile(np.eye(3).ravel(), (2, 1))
-    assert len(near.query(np.zeros((2, 3)), xmat, np.inf)[0]) == 0
+    assert len(workspace(placed(PLANE), placed(PLANE))(np.inf)[0]) == 0
 
 
 # Which pairs are near.
@@ -457,16 +460,38 @@ def test_what_was_asked_before_changes_no_answer(size, rng):
     assert found > 300
 
 
+@pytest.mark.parametrize(("a", "b"), ANY_TWO)
+def test_pairs_are_near_to_the_last_hundredth_of_a_millimetre(a, b, rng):
+    """No bound is farther than the distance."""
+    for _ in range(20):
+        one, other = drawn(a, rng), drawn(b, rng)
+        if asked(one, other).distance < 0.0:
+            continue
+        for gap, met in ((0.05 - 1e-5, 1), (0.05 + 1e-5, 0)):
+            near = shifted(one, other, gap)
+            for first, second in ((one, near), (near, one)):
+                question = workspace(first, second)
+                assert len(question(0.05)[0]) == met
+
+
+def test_what_a_turn_alone_brings_near_is_found(rng):
+    """The tip of a long capsule strikes a ball: no bound of the move is shorter."""
+    rod, angles = placed(CAPSULE, (1e-4, 1.0, 0.0)), rng.uniform(1e-3, 3.0, 30)
+    for angle in angles:
+        turned = replace(rod, R=Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix())
+        way = turned.R[:, 2] - rod.R[:, 2]
+        ball = turned.R[:, 2] + way / np.linalg.norm(way) * 0.002
+        near = workspace(rod, placed(SPHERE, (1e-3, 0, 0), ball))
+        assert len(near(1e-3)[0]) == 0
+        assert len(near(1e-3, turned)[0]) == 1
+
+
 def test_a_plane_that_turns_is_looked_at_again():
-    kinds = np.array([PLANE, SPHERE], dtype=np.int32)
-    empty = [np.zeros((0, 3))] * 2
-    pairs = np.array([[0, 1]], dtype=np.int32)
-    near = _core.Proximity(kinds, np.full((2, 3), 0.1), empty, pairs)
-    x = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 1.0]])
-    level, tilted = np.eye(3), Rotation.from_rotvec([0, 2e-3, 0]).as_matrix()
-    for R, met in ((level, 0), (tilted, 0), (tilted.T, 1), (level, 0)):
-        xmat = np.array([R.ravel(), np.eye(3).ravel()])
-        assert len(near.query(x, xmat, 0.1)[0]) == met
+    plane = placed(PLANE)
+    near = workspace(plane, placed(SPHERE, (0.1, 0, 0), (1e3, 0.0, 1.0)))
+    for angle, met in ((0.0, 0), (2e-3, 0), (-2e-3, 1), (0.0, 0)):
+        R = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+        assert len(near(0.1, replace(plane, R=R))[0]) == met
 
 
 def test_a_workspace_says_what_it_cannot_take():
