@@ -37,7 +37,7 @@ from clamber.execution.executive import (
 )
 from clamber.execution.probe import PROBE_SPEED, REACH
 from clamber.execution.sensors import Measurement
-from clamber.execution.servo import JointServo, self_positioning_joints
+from clamber.execution.servo import joint_servo, self_positioning_joints
 from clamber.execution.simulation import has_fallen, simulate
 from clamber.execution.unintended import RETREATS, UnintendedContact
 from clamber.execution.verdict import END_SPEED, Figure, judge
@@ -689,12 +689,13 @@ def test_what_is_loaded_in_place_of_a_contact_hits_no_side(
 
 def test_open_loop_the_trajectory_is_followed_sample_by_sample(demo_plan, rng):
     world, t = demo_plan.world, demo_plan.trajectory
-    follower, servo = OpenLoop(demo_plan, world), JointServo(world)
+    follower, servo = OpenLoop(demo_plan, world), joint_servo(world)
     force = np.full((len(world.surfaces), 3), 500.0)  # at which it does not look
     for k in range(300):
         q = t.q[k] + rng.normal(0.0, 1e-3, len(t.q[k]))
         expected = servo.command(
-            t.q[k, world.qadr], t.v[k, world.dadr], t.tau[k], q[world.qadr]
+            *(t.q[k, world.qadr], t.v[k, world.dadr], t.tau[k], q[world.qadr]),
+            np.zeros(len(world.qadr)),
         )
         assert np.array_equal(follower.command(Measurement(q, force)), expected)
         assert follower.left == len(t.time) - 1 - k

@@ -17,40 +17,50 @@ def ref(hands_plan) -> Reference:
     return Reference(hands_plan.trajectory, hands_plan.world)
 
 
-def exhaust(actions) -> int:
-    return sum(1 for _ in actions)
+PERIOD = 10  # steps after which a controller looks around
+
+
+def steps(ref: Reference, actions):
+    """The steps of actions, which go on as a controller has them go on."""
+    for _ in actions:
+        while ref.track.advance():
+            yield
+            if not ref.track.done % PERIOD:
+                break
+
+
+def exhaust(ref: Reference, actions) -> int:
+    return sum(1 for _ in steps(ref, actions))
 
 
 def test_playing_goes_to_a_sample_or_until_something_happens(ref, hands_plan):
     t, dadr = hands_plan.trajectory, hands_plan.world.dadr
-    assert exhaust(ref.play(700)) == 700
+    assert exhaust(ref, ref.play(700)) == 700
     assert ref.i == 700
-    assert np.array_equal(ref.q, t.q[700])
-    assert np.array_equal(ref.torque, t.tau[700])
-    assert np.array_equal(ref.velocity, t.v[700, dadr])
-    assert np.array_equal(ref.closed, t.contact[700])
-    assert exhaust(ref.play(900, until=lambda: ref.i >= 750)) == 50
-    assert exhaust(ref.play(740)) == 0
-    assert np.array_equal(ref.closed_ahead(0.2), t.contact[950])
-    assert np.array_equal(ref.closed_ahead(1e3), t.contact[-1])
+    assert np.array_equal(ref.track.q, t.q[700])
+    assert np.array_equal(ref.track.torque, t.tau[700])
+    assert np.array_equal(ref.track.velocity, t.v[700, dadr])
+    assert np.array_equal(ref.track.closed, t.contact[700])
+    assert exhaust(ref, ref.play(900, until=lambda: ref.i >= 750)) == 50
+    assert exhaust(ref, ref.play(740)) == 0
     assert not ref.left_plan
 
 
 def test_going_back_is_the_way_in_reverse(ref, hands_plan):
     t, dadr = hands_plan.trajectory, hands_plan.world.dadr
-    exhaust(ref.play(900))
-    assert exhaust(ref.back(800)) == 100
-    assert np.array_equal(ref.q, t.q[800])
-    assert np.array_equal(ref.velocity, -t.v[800, dadr])
+    exhaust(ref, ref.play(900))
+    assert exhaust(ref, ref.back(800)) == 100
+    assert np.array_equal(ref.track.q, t.q[800])
+    assert np.array_equal(ref.track.velocity, -t.v[800, dadr])
     assert ref.left_plan
 
 
 def test_resting_holds_the_reference_without_velocity(ref):
-    exhaust(ref.play(900))
-    q = ref.q
-    assert exhaust(ref.rest(0.25)) == 250
-    assert np.array_equal(ref.q, q)
-    assert not ref.velocity.any()
+    exhaust(ref, ref.play(900))
+    q = ref.track.q.copy()
+    assert exhaust(ref, ref.rest(0.25)) == 250
+    assert np.array_equal(ref.track.q, q)
+    assert not ref.track.velocity.any()
     assert ref.left_plan
 
 
@@ -60,12 +70,12 @@ def test_aside_goes_until_something_happens_or_there_and_back(ref, hands_plan, f
     way = replace(
         t, **{n: getattr(t, n)[900:1000] for n in ("time", "q", "v", "tau", "contact")}
     )
-    exhaust(ref.play(900))
-    ticks = exhaust(ref.aside(way, lambda: found and ref.q[0] == way.q[60][0]))
-    assert ticks == (61 if found else 200)
-    assert np.array_equal(ref.q, way.q[60 if found else 0])
-    if found:
-        assert not ref.velocity.any()
+    exhaust(ref, ref.play(900))
+    ticks = exhaust(
+        ref, ref.aside(way, lambda: found and ref.track.q[0] == way.q[59][0])
+    )
+    assert ticks == (60 if found else 200)
+    assert np.array_equal(ref.track.q, way.q[59 if found else 0])
     assert ref.i == 900  # the trajectory is where it was left
     assert ref.left_plan
 
@@ -85,12 +95,13 @@ def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
         tau=(t.tau[i] + 3.0)[None],
         contact=t.contact[i][None],
     )
-    exhaust(ref.play(i))
-    next(ref.aside(away, lambda: False))
+    exhaust(ref, ref.play(i))
+    next(steps(ref, ref.aside(away, lambda: False)))
     ref.resume()
-    start, rows = ref.q.copy(), []
-    for _ in ref.play(i + n + 20):
-        rows.append((ref.q, ref.velocity, ref.torque))
+    track, rows = ref.track, []
+    start = track.q.copy()
+    for _ in steps(ref, ref.play(i + n + 20)):
+        rows.append((track.q.copy(), track.velocity.copy(), track.torque.copy()))
     q, v, tau = (np.array(x) for x in zip(*rows, strict=True))
     assert np.abs(kin.difference(start, q[0])).max() < 1e-3
     assert np.allclose(q[n + 1 :], t.q[i + n + 2 : i + n + 21], atol=1e-12)
@@ -105,16 +116,39 @@ def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
 
 def test_what_was_commanded_is_kept_where_it_is_not_the_trajectory(ref, hands_plan):
     t, world = hands_plan.trajectory, hands_plan.world
-    for _ in ref.play(500):
-        ref.record(ref.q)
-    assert ref.seconds == pytest.approx(0.499)
-    assert ref.followed(t.keyframes) is None
-    for _ in ref.rest(0.1):
-        ref.record(ref.q + 1e-3)
-    done = ref.followed(t.keyframes[:1])
+    q = [ref.track.q.copy() for _ in steps(ref, ref.play(500))]
+    assert ref.followed(np.array(q), t.keyframes) is None
+    q += [ref.track.q + 1e-3 for _ in steps(ref, ref.rest(0.1))]
+    done = ref.followed(np.array(q), t.keyframes[:1])
     assert len(done.time) == 600
     assert np.array_equal(done.q[:500], t.q[1:501])
     assert np.array_equal(done.q[500:], np.tile(t.q[500] + 1e-3, (100, 1)))
     assert np.array_equal(done.v[:500, world.dadr], t.v[1:501, world.dadr])
+    assert not done.v[500:].any()
     assert not done.v[:, :6].any()
     assert np.array_equal(done.contact[:500], t.contact[1:501])
+
+
+def test_what_was_left_in_the_middle_is_kept_as_far_as_it_was_followed(ref, hands_plan):
+    """Forwards, back and forwards again."""
+    t = hands_plan.trajectory
+    exhaust(ref, ref.play(900, until=lambda: ref.i == 850))
+    exhaust(ref, ref.back(840))
+    exhaust(ref, ref.play(845))
+    rows = [*range(1, 851), *range(849, 839, -1), *range(841, 846)]
+    done = ref.followed(t.q[rows], t.keyframes)
+    assert np.array_equal(done.tau, t.tau[rows])
+    assert np.array_equal(done.contact, t.contact[rows])
+
+
+def test_foot_contacts_are_told_a_second_ahead(hands_plan):
+    """That ankles are held again before a foot steps."""
+    t = hands_plan.trajectory
+    later = replace(t, contact=np.arange(len(t.time))[:, None] < [1500] * 8)
+    ref = Reference(later, hands_plan.world)
+    ahead = [ref.track.ahead[0] for _ in steps(ref, ref.play(600))]
+    assert ahead.index(False) == 1500 - 1000 - 1
+    exhaust(ref, ref.rest(0.01))
+    assert not ref.track.ahead.any()
+    exhaust(ref, ref.back(499))
+    assert ref.track.ahead.all()

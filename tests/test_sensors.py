@@ -15,7 +15,7 @@ from clamber.execution.sensors import (
     POSITION_NOISE,
     ROTATION_NOISE,
     Sensors,
-    surface_forces,
+    contact_forces,
 )
 from clamber.model.scene import Scene
 from clamber.model.world import World, build_world
@@ -76,6 +76,13 @@ def summed_by_mujoco(world: World, data: mujoco.MjData) -> np.ndarray:
     return out
 
 
+def surface_forces(world: World, data: mujoco.MjData) -> np.ndarray:
+    """(surfaces, 3) as they are sensed."""
+    forces = contact_forces(world)
+    forces.update(data)
+    return forces.surface
+
+
 def read_many(world, data, n=N, **kw):
     s = sensors(world, **kw)
     readings = [s.read(data) for _ in range(n)]
@@ -101,7 +108,7 @@ def test_without_noise_and_delay_it_is_the_truth(world):
         reading = s.read(data)
         assert np.array_equal(reading.q, data.qpos)
         if k % FORCE_STRIDE == 0:
-            force = surface_forces(data, rows_of(world), len(world.surfaces))
+            force = surface_forces(world, data)
         assert np.array_equal(reading.force, force)
 
 
@@ -160,7 +167,7 @@ def test_the_base_has_the_stated_noise_and_stays_a_pose(world, stood):
 
 
 def test_forces_have_noise_that_grows_with_the_force(world, stood):
-    truth = surface_forces(stood, rows_of(world), len(world.surfaces))
+    truth = surface_forces(world, stood)
     _, force = read_many(world, stood, 8 * N, noise=1.0)
     e = (force - truth)[::FORCE_STRIDE]
     expected = np.hypot(FORCE_NOISE, FORCE_SCALE_NOISE * np.abs(truth))
@@ -184,7 +191,7 @@ def test_noise_is_white_also_from_one_block_to_the_next(world, stood):
 def test_the_factor_multiplies_all_noise(world, stood, factor):
     q, force = read_many(world, stood, 60, noise=1.0)
     q2, force2 = read_many(world, stood, 60, noise=factor)
-    truth = surface_forces(stood, rows_of(world), len(world.surfaces))
+    truth = surface_forces(world, stood)
     far = [*range(3), *world.qadr]
     assert np.allclose((q2 - stood.qpos)[:, far], factor * (q - stood.qpos)[:, far])
     assert np.allclose(force2 - truth, factor * (force - truth))
@@ -209,7 +216,7 @@ def test_the_same_seed_has_the_same_noise_and_another_other(world, stood):
 
 
 def test_standing_still_the_feet_bear_the_weight(world, stood):
-    force = surface_forces(stood, rows_of(world), len(world.surfaces))
+    force = surface_forces(world, stood)
     weight = 9.81 * world.mass
     total = force.sum(axis=0)
     assert total[2] == pytest.approx(weight, rel=2e-3)
@@ -229,7 +236,7 @@ def test_forces_are_those_that_mujoco_sums_contact_by_contact(demo_plan, seed):
         data.qpos[2] -= 0.002
         data.qvel[:] = rng.normal(0.0, 0.2, world.model.nv)
         mujoco.mj_forward(world.model, data)
-        force = surface_forces(data, rows_of(world), len(world.surfaces))
+        force = surface_forces(world, data)
         expected = summed_by_mujoco(world, data)
         assert np.allclose(force, expected, atol=1e-9)
         pressed += np.count_nonzero(np.linalg.norm(expected, axis=1) > 1.0)
@@ -246,7 +253,7 @@ def test_a_link_that_is_no_surface_is_not_felt(world):
     for _ in range(400):
         mujoco.mj_step(world.model, data)
     expected = summed_by_mujoco(world, data)
-    force = surface_forces(data, rows_of(world), len(world.surfaces))
+    force = surface_forces(world, data)
     assert np.allclose(force, expected, atol=1e-9)
     assert data.ncon > 0
     assert force[:, 2].sum() < 0.7 * 9.81 * world.mass

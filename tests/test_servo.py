@@ -11,9 +11,9 @@ import pytest
 from clamber.execution.servo import (
     EASING,
     INTEGRAL_LIMIT,
-    JointServo,
-    SelfPositioning,
     driven_world,
+    joint_servo,
+    self_positioning,
     self_positioning_joints,
 )
 from clamber.model.world import PHYSICS_STEP
@@ -23,11 +23,12 @@ class PID:
     """The law on the samples of a trajectory."""
 
     def __init__(self, world, trajectory):
-        self.law, self.world, self.trajectory = JointServo(world), world, trajectory
+        self.law, self.world, self.trajectory = joint_servo(world), world, trajectory
 
     def command(self, k: int, q: np.ndarray) -> np.ndarray:
         w, t = self.world, self.trajectory
-        return self.law.command(t.q[k, w.qadr], t.v[k, w.dadr], t.tau[k], q)
+        held = np.zeros(len(q))
+        return self.law.command(t.q[k, w.qadr], t.v[k, w.dadr], t.tau[k], q, held)
 
 
 @pytest.fixture
@@ -183,7 +184,7 @@ def test_only_servos_differ_between_the_worlds_of_the_modes(demo_plan):
 def test_a_joint_that_positions_itself_is_left_its_feed_forward(demo_plan):
     """(4.32): the measured angle is the reference, whatever the error has been."""
     world = demo_plan.world
-    law, n = JointServo(world), len(world.joints)
+    law, n = joint_servo(world), len(world.joints)
     free = np.zeros(n)
     free[3] = 1.0
     q, tau = np.zeros(n), np.full(n, 2.0)
@@ -192,7 +193,7 @@ def test_a_joint_that_positions_itself_is_left_its_feed_forward(demo_plan):
     assert world.kp[3] * (u[3] - q[3]) == pytest.approx(2.0)
     assert np.all(world.kp[:3] * (u[:3] - q[:3]) > 50.0)
     # The error of that time does not come back when the joint is held again.
-    u = law.command(q, np.zeros(n), tau, q)
+    u = law.command(q, np.zeros(n), tau, q, np.zeros(n))
     assert world.kp[3] * (u[3] - q[3]) == pytest.approx(2.0)
 
 
@@ -209,20 +210,21 @@ def test_ankles_are_those_of_each_foot(demo_plan):
     plain = replace(world, robot=replace(world.robot, self_positioning=()))
     assert self_positioning_joints(plain) == {}
     nothing = np.zeros(len(world.surfaces), dtype=bool)
-    assert SelfPositioning(plain).share(nothing, nothing, nothing) is None
+    on = ~nothing
+    assert not self_positioning(plain).share(on, on, on).any()
 
 
 def test_ankles_position_themselves_only_while_both_arms_are_loaded(demo_plan):
     """Eased in and out; before a foot steps its ankle is held, the other goes on."""
     world = demo_plan.world
-    ankles, feet = SelfPositioning(world), self_positioning_joints(world)
+    ankles, feet = self_positioning(world), self_positioning_joints(world)
     free = np.any(list(feet.values()), axis=0)
     down = np.ones(len(world.surfaces), dtype=bool)
     n = round(EASING / PHYSICS_STEP)
 
     def share(*loaded: str, ahead: np.ndarray = down) -> np.ndarray:
         on = [s in loaded for s in world.surfaces]
-        return ankles.share(on, down, ahead).copy()
+        return ankles.share(np.array(on), down, ahead)
 
     for _ in range(n):
         assert not share("LHand").any()

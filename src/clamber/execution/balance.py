@@ -37,7 +37,11 @@ DAMPING = 1e-4  # of the least-squares posture, where contacts are redundant
 
 
 class Balance:
-    """The feedback above for one robot, with its integral."""
+    """The feedback above for one robot, with its integral.
+
+    Attributes:
+        goal: (na,) [rad] to add to the reference, eased in by `SMOOTHING`.
+    """
 
     def __init__(self, world: World, period: float) -> None:
         """Feed back every `period` [s]."""
@@ -45,8 +49,7 @@ class Balance:
         self._period = period
         self._deviation = np.zeros(2)
         self._integral = np.zeros(2)
-        self._goal = np.zeros(len(world.dadr))
-        self._offset = np.zeros(len(world.dadr))
+        self.goal = np.zeros(len(world.dadr))
 
     def update(
         self, q: np.ndarray, reference: np.ndarray, contacts: Sequence[Contact]
@@ -80,7 +83,7 @@ class Balance:
             x *= MOST / max(float(np.linalg.norm(x)), MOST)
         if w == 0.0 and np.linalg.norm(self._integral) < SETTLED:
             self._integral[:] = 0.0
-            self._goal[:] = 0.0
+            self.goal[:] = 0.0
             return
         rows = [kin.com_jacobian()[:2].copy()]
         for contact in contacts:
@@ -95,12 +98,7 @@ class Balance:
         wanted = np.zeros(len(A))
         wanted[:2] = shift
         y = np.linalg.solve(A @ A.T + DAMPING * np.eye(len(A)), wanted)
-        self._goal[:] = (A.T @ y)[kin.world.dadr]
-
-    def offset(self, dt: float) -> np.ndarray:
-        """(na,) [rad] to add to the reference, `dt` [s] after it was last asked for."""
-        self._offset += dt / SMOOTHING * (self._goal - self._offset)
-        return self._offset
+        self.goal[:] = (A.T @ y)[kin.world.dadr]
 
     def _seen(
         self, q: np.ndarray, contacts: Sequence[Contact]

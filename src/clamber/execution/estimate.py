@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.contact.steps import MOVED
 from clamber.execution.probe import REACH
@@ -37,6 +38,7 @@ class Estimate:
     Attributes:
         world: As it is believed to be; kin: a workspace of it.
         surfaces: Names of the nS surfaces.
+        filter: Of what is measured.
         q: (nq,) filtered posture.
         load: (nS, 3) filtered forces on the surfaces [N], world axes.
     """
@@ -45,8 +47,13 @@ class Estimate:
         """Begin in posture `q` (nq,), nothing loaded."""
         self.believe(world)
         self.surfaces = tuple(world.surfaces)
-        self.q = q.copy()
-        self.load = np.zeros((len(self.surfaces), 3))
+        self.filter = _core.Filter(
+            q.tolist(),
+            len(self.surfaces),
+            pose_share=PHYSICS_STEP / POSE_SMOOTHING,
+            force_share=PHYSICS_STEP / FORCE_SMOOTHING,
+        )
+        self.q, self.load = self.filter.q, self.filter.load
         self._measured: dict[tuple[str, int], tuple[str, np.ndarray]] = {}
 
     def believe(self, world: World) -> None:
@@ -55,12 +62,13 @@ class Estimate:
 
     def update(self, m: Measurement) -> None:
         """Take in the measurement of one physics step."""
-        self.load += PHYSICS_STEP / FORCE_SMOOTHING * (m.force - self.load)
-        q = self.q
-        if m.q[3:7] @ q[3:7] < 0:
-            q[3:7] *= -1
-        q += PHYSICS_STEP / POSE_SMOOTHING * (m.q - q)
-        q[3:7] /= math.sqrt(q[3:7] @ q[3:7])
+        self.filter.update(m.q, m.force)
+
+    def expect(self, *contacts: Contact) -> None:
+        """Have a decision taken at once where a surface of these is pressed."""
+        rows = [self.row(c.surface) for c in contacts]
+        normals = [self.world.supports[c.support].normal for c in contacts]
+        self.filter.watch(rows, np.array(normals).reshape(-1, 3), TOUCH)
 
     def row(self, surface: str) -> int:
         """Of a surface in the forces."""

@@ -24,10 +24,11 @@ from typing import Any
 
 import numpy as np
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
-from clamber.execution.balance import Balance
+from clamber.execution.balance import SMOOTHING, Balance
 from clamber.execution.estimate import LOST, TOUCH, Estimate
 from clamber.execution.events import (
     ContactMoved,
@@ -45,9 +46,9 @@ from clamber.execution.events import (
 )
 from clamber.execution.probe import REACH, guarded_move
 from clamber.execution.progress import Progress, Span
-from clamber.execution.reference import Reference, Ticks
+from clamber.execution.reference import Actions, Reference
 from clamber.execution.sensors import Measurement
-from clamber.execution.servo import JointServo, SelfPositioning
+from clamber.execution.servo import joint_servo, self_positioning
 from clamber.execution.unintended import Watch
 from clamber.model.scene import Scene
 from clamber.model.se3 import wrap, yaw_of
@@ -67,10 +68,10 @@ MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 1.0  # [s] the robot stands still while the rest is planned again
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
-AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for such a load
 LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
+PART = 10_000  # samples that are followed open loop, before the next ones are made
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
 FIRST = round(HOLD_START / PHYSICS_STEP) - 1  # sample from which a trajectory moves
 
@@ -79,15 +80,22 @@ Reaction = Generator[None, None, bool]
 
 
 class OpenLoop:
-    """The trajectory as it is, sample by sample."""
+    """The trajectory as it is, sample by sample.
+
+    Attributes:
+        core: What is done at every physics step.
+    """
 
     def __init__(self, plan: Plan, world: World) -> None:
         """Follow `plan` on the servos of `world`."""
         assert plan.trajectory is not None
-        self._trajectory = plan.trajectory
-        self._servo = JointServo(world)
-        self._qadr, self._dadr = world.qadr, world.dadr
-        self._k = -1
+        t = plan.trajectory
+        self._last = len(t.time) - 1
+        self._ref = Reference(t, world)
+        self._ref.follow(t, -1)
+        filter_ = Estimate(plan.world, t.q[0]).filter
+        still = replace(world, robot=replace(world.robot, self_positioning=()))
+        self.core = _follower(world, filter_, self._ref, self_positioning(still))
         self.events: list[Event] = []
         self.followed: Trajectory | None = None
         final = plan.keyframes[-1].stance
@@ -95,50 +103,54 @@ class OpenLoop:
 
     def command(self, measured: Measurement) -> np.ndarray:
         """(na,) servo command of the next physics step."""
-        self._k = k = self._k + 1
-        t = self._trajectory
-        q, v = t.q[k, self._qadr], t.v[k, self._dadr]
-        return self._servo.command(q, v, t.tau[k], measured.q[self._qadr])
+        return self.core.command(measured.q, measured.force, self)
+
+    def decide(self, look: bool) -> None:
+        """Go on with the next part of the trajectory, if it is time."""
+        del look
+        if self._ref.track.left == 0:
+            end = min(self._ref.i + PART, self._last)
+            self.core.ends = self._last - end < PART
+            next(self._ref.play(self._last if self.core.ends else end))
+
+    def balance(self) -> None:
+        """Nothing is measured."""
 
     @property
     def reference(self) -> np.ndarray:
         """(nq,) of the last command."""
-        return self._trajectory.q[self._k]
+        return self._ref.track.q
 
     @property
     def left(self) -> int:
         """Physics steps to the end."""
-        return len(self._trajectory.time) - 1 - self._k
+        return self._last - self._ref.i
 
 
 class Executive:
     """Follows a plan and reacts to what it measures; see the module's docstring.
 
     What it does is written as one sequence of actions (`_behave`), each of which takes
-    some physics steps: a generator that sets the reference and yields once for each.
+    some physics steps: a generator that says what to follow and yields until that is
+    done, or something may have happened.
 
     Attributes:
+        core: What is done at every physics step.
         estimate: What is known; watch: what it looks out for.
         events: What was measured, and done about it.
         done: Steps of the plan's sequence that have been done.
-        left: Physics steps to the end, as far as is known.
         stopped: Why it stopped; empty where it did not.
-        rests_on: At the end, contacts by `surface@support`.
     """
 
     def __init__(self, plan: Plan, world: World) -> None:
         """Follow `plan` on the servos of `world`, which is not looked at otherwise."""
         assert plan.trajectory is not None
         self._plan = plan
-        self._servo, self._ankles = JointServo(world), SelfPositioning(world)
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
-        self._qadr = world.qadr
         speed = plan.options.speed
         self._slow = speed != "max" and speed <= SLOW
-        self._scale = 1.0  # of the torques: mass as measured over mass as described
         self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
         self._searches = 0
-        self._k = 0  # physics steps so far
         self.done = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance: it has no steps to count.
         by_policy = plan.policy is not None
@@ -147,45 +159,56 @@ class Executive:
         self._begun = self.done
         # [s] when each keyframe of the plan was reached
         self._reached = [float(plan.trajectory.keyframes[0])]
-        self.left = len(plan.trajectory.time)
         self.events: list[Event] = []
         self.stopped = ""
-        self.rests_on: tuple[str, ...] = ()
         self.estimate = Estimate(plan.world, plan.trajectory.q[0])
         self._ref = Reference(plan.trajectory, plan.world)
+        ankles = self_positioning(world)
+        self.core = _follower(world, self.estimate.filter, self._ref, ankles)
         self._adopt(plan, plan.trajectory, 0)
         self._behaviour = self._behave()
 
     def command(self, measured: Measurement) -> np.ndarray:
         """(na,) servo command of the next physics step."""
-        self.estimate.update(measured)
-        if self._slow and self._k % LOOK_STRIDE == 0:
+        return self.core.command(measured.q, measured.force, self)
+
+    def decide(self, look: bool) -> None:
+        """What to follow next; `look` once every `LOOK_STRIDE` steps."""
+        if look and self._slow:
             self.watch.look(self.estimate.load, self._in_use)
         next(self._behaviour)
-        self._k += 1
-        ref, q = self._ref, self._balanced()
-        ref.record(q)
-        return self._servo.command(
-            q[self._qadr],
-            ref.velocity,
-            self._scale * ref.torque,
-            measured.q[self._qadr],
-            self._ankles.share(
-                (self.estimate.load[:, 2] > TOUCH).tolist(),
-                ref.closed,
-                ref.closed_ahead(AHEAD),
-            ),
-        )
+
+    def balance(self) -> None:
+        """Move the centre of mass from its reference where balance asks for it."""
+        if not self._slow:  # in faster motion the robot need not balance statically
+            return
+        now, track = self.estimate, self._ref.track
+        closed = self._at_hand.closed_contacts(track.closed, now.surfaces)
+        self._balance.update(now.q, track.q, closed)
+        self.core.goal[:] = self._balance.goal
 
     @property
     def reference(self) -> np.ndarray:
         """(nq,) of the last command, but for what the balance adds."""
-        return self._ref.q
+        return self._ref.track.q
+
+    @property
+    def left(self) -> int:
+        """Physics steps to the end, as far as is known."""
+        if self.core.ends:
+            return self._ref.track.left
+        assert self._plan.trajectory is not None
+        return len(self._plan.trajectory.time)
+
+    @property
+    def rests_on(self) -> tuple[str, ...]:
+        """At the end, contacts by `surface@support`."""
+        return () if self.left else tuple(_resting(self.estimate, self.stance))
 
     @property
     def followed(self) -> Trajectory | None:
         """What was followed, where that is not the plan; velocities of joints only."""
-        return self._ref.followed(np.array(self._reached))
+        return self._ref.followed(self.core.commanded, np.array(self._reached))
 
     @property
     def stance(self) -> tuple[Contact, ...]:
@@ -194,7 +217,7 @@ class Executive:
 
     # What it does.
 
-    def _behave(self) -> Ticks:
+    def _behave(self) -> Actions:
         yield from self._ref.play(FIRST)
         yield from self._check_start()
         while not self.stopped:
@@ -209,7 +232,7 @@ class Executive:
             self._stop(self._at_hand.failure)
         yield from self._end()
 
-    def _make_change(self, span: Span) -> Ticks:
+    def _make_change(self, span: Span) -> Actions:
         """One contact change: shift, swing, touch, settle."""
         if span.makes is not None and (yield from self._make(span, span.makes)):
             return
@@ -225,15 +248,16 @@ class Executive:
     def _make(self, span: Span, c: Contact) -> Reaction:
         """Close a contact; false where that went as planned."""
         ref, touches = self._ref, self.estimate.touches
-        near = 0.5 * (span.swing + span.touch)
         # The way to where the change begins may be what ends an unintended contact.
-        yield from ref.play(
-            span.touch,
-            until=lambda: (
-                (ref.i > near and touches(c))
-                or (ref.i > span.begin and self._is_unintended())
-            ),
-        )
+        yield from ref.play(span.begin + 1)
+        near = (span.swing + span.touch) // 2 + 1
+        yield from ref.play(near, until=self._is_unintended)
+        if self.watch.found is None:
+            self.estimate.expect(c)
+            yield from ref.play(
+                span.touch, until=lambda: touches(c) or self._is_unintended()
+            )
+            self.estimate.expect()
         if self.watch.found is not None:
             yield from self._retreat(span.begin)
             return True
@@ -253,7 +277,7 @@ class Executive:
             return False
         return True
 
-    def _go_ahead(self) -> Ticks:
+    def _go_ahead(self) -> Actions:
         """What was planned ahead of a policy has been done: the next steps of it."""
         key = self._at_hand.keyframes[-1]
         scene, clearance = self.estimate.world.scene, self.watch.clearance
@@ -266,14 +290,14 @@ class Executive:
         self._adopt(found, found.trajectory, 0)
         yield from self._ref.play(FIRST)
 
-    def _check_start(self) -> Ticks:
+    def _check_start(self) -> Actions:
         """Is the robot where it should be, and as heavy?"""
         world = self.estimate.world
         weight = self.watch.weight = float(self.estimate.load[:, 2].sum())
         ratio = weight / (9.81 * world.mass)
         if abs(ratio - 1.0) > MASS_CHANGE:
             self._note(Heavier, factor=ratio)
-            self._scale = float(np.clip(ratio, 0.5, 2.0))
+            self.core.scale = float(np.clip(ratio, 0.5, 2.0))
         if self._plan.state is not None:
             yield from self._check_stance()
             return
@@ -293,7 +317,7 @@ class Executive:
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
-    def _check_stance(self) -> Ticks:
+    def _check_stance(self) -> Actions:
         """At a keyframe: the reactions that are due, the most urgent first."""
         if self._at_hand.is_through and not self._at_hand.goes_on:
             return  # the last one: nothing depends on it
@@ -302,15 +326,10 @@ class Executive:
             if (yield from react()):
                 return
 
-    def _end(self) -> Ticks:
+    def _end(self) -> Actions:
         """Hold the last posture."""
-        n = round(HOLD_END / PHYSICS_STEP)
-        self._ref.stand()
-        for k in range(n):
-            self.left = n - 1 - k
-            if self.left == 0:
-                self.rests_on = tuple(_resting(self.estimate, self.stance))
-            yield
+        self.core.ends = True
+        yield from self._ref.hold(HOLD_END)
 
     # How it reacts.
 
@@ -321,7 +340,7 @@ class Executive:
         yield from self._retreat(self._ref.i)
         return True
 
-    def _retreat(self, to: int, makes: Contact | None = None) -> Ticks:
+    def _retreat(self, to: int, makes: Contact | None = None) -> Actions:
         """A link is loaded where it should not be: back, on with more clearance of it.
 
         `makes` is a contact that carries nothing as yet back there.
@@ -338,7 +357,7 @@ class Executive:
         if self._at_hand is at_hand:
             self.watch.accept(at)
 
-    def _take(self, made: Contact, planned: Contact) -> Ticks:
+    def _take(self, made: Contact, planned: Contact) -> Actions:
         """A contact is made where it was not planned: the rest is planned again."""
         limb = self._plan.world.robot.limb_of(made.surface)
         stance = [
@@ -348,9 +367,11 @@ class Executive:
         self._count_change()
         yield from self._replan((*stance, made), stance)
 
-    def _seek(self, c: Contact) -> Ticks:
+    def _seek(self, c: Contact) -> Actions:
         """A contact is not found where it was planned: another place for the limb."""
-        missing = Missing(time=self._k * PHYSICS_STEP, surface=c.surface, depth=REACH)
+        missing = Missing(
+            time=self.core.steps * PHYSICS_STEP, surface=c.surface, depth=REACH
+        )
         if self._searches == SEARCHES:
             self._stop(str(missing))
             return
@@ -410,10 +431,15 @@ class Executive:
             return found is not None
 
         if t is not None:
+            limb = self._plan.world.robot.limb_of(c.surface)
+            estimate.expect(*(replace(c, surface=s) for s in limb.surfaces))
             yield from ref.aside(t, touches)
+            estimate.expect()
         return found
 
-    def _replan(self, contacts: Sequence[Contact], loaded: Sequence[Contact]) -> Ticks:
+    def _replan(
+        self, contacts: Sequence[Contact], loaded: Sequence[Contact]
+    ) -> Actions:
         """Take the stance as it is and plan the remaining steps again."""
         yield from self._ref.rest(LOOK)
         estimate = self.estimate
@@ -435,7 +461,7 @@ class Executive:
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
-    def _follow(self, found: Plan, off: float) -> Ticks:
+    def _follow(self, found: Plan, off: float) -> Actions:
         """Go by another plan; or, where that is worse, by the one at hand."""
         why = str(found.failures[0]) if found.failures else ""
         no_better = why and off < FALLBACK and not self._at_hand.failure
@@ -452,7 +478,7 @@ class Executive:
             # There is still the way to the last posture.
             yield from self._ref.play(found.trajectory.segments[-1].begin - 1)
 
-    def _keep_plan(self, off: float, why: str) -> Ticks:
+    def _keep_plan(self, off: float, why: str) -> Actions:
         """No other plan was found: the one at hand may do, or may not."""
         if self._steps and self.done == self._steps:
             self._note(KeptStance, why=why)
@@ -479,7 +505,7 @@ class Executive:
         self._at_hand = Progress(plan, trajectory)
 
     def _note(self, kind: type[Event], **what: Any) -> None:
-        self.events.append(kind(time=self._k * PHYSICS_STEP, **what))
+        self.events.append(kind(time=self.core.steps * PHYSICS_STEP, **what))
 
     def _note_moved(self, c: Contact, planned: Contact, *, made: bool) -> None:
         above, aside = self.estimate.deviation(c)
@@ -491,24 +517,12 @@ class Executive:
         at_hand = self._at_hand
         index = at_hand.plan.changes[at_hand.change].step.index
         at_hand.change += 1
-        now, n = self._ref.seconds, len(self._reached)
+        now, n = (self.core.steps - 1) * PHYSICS_STEP, len(self._reached)
         if index is not None:
             self.done = index + 1
             n = self.done - self._begun  # one that is made again counts once
         self._reached += [now] * (n - len(self._reached))
         self._reached[n:] = [now]
-
-    def _balanced(self) -> np.ndarray:
-        """(nq,) the reference, its centre of mass moved where balance asks for it."""
-        if not self._slow:  # in faster motion the robot need not balance statically
-            return self.reference
-        if self._k % LOOK_STRIDE == 0:
-            now = self.estimate
-            closed = self._at_hand.closed_contacts(self._ref.closed, now.surfaces)
-            self._balance.update(now.q, self.reference, closed)
-        q = self.reference.copy()
-        q[self._qadr] += self._balance.offset(PHYSICS_STEP)
-        return q
 
     def _in_use(self) -> set[str]:
         """Surfaces in contact or about to be, or loaded in place of one that is."""
@@ -530,6 +544,22 @@ class Executive:
         self.estimate.kin.update(self.estimate.q)
         load = self.estimate.load
         return self.watch.find(self.estimate.kin, load, self._in_use, moving)
+
+
+def _follower(
+    world: World, filter_: _core.Filter, ref: Reference, ankles: _core.SelfPositioning
+) -> _core.Follower:
+    """What follows a reference on the servos of a world."""
+    return _core.Follower(
+        filter_,
+        ref.track,
+        joint_servo(world),
+        ankles,
+        qadr=world.qadr.tolist(),
+        period=LOOK_STRIDE,
+        touch=TOUCH,
+        shift_share=PHYSICS_STEP / SMOOTHING,
+    )
 
 
 def _rest(

@@ -1,7 +1,7 @@
 """A trajectory, sample by sample, and the ways to leave it and to come back.
 
-Each action is a generator that sets the reference and yields once for every physics
-step that it takes.
+Each action is a generator. It says what the joints are to do in the steps to come, and
+yields; it goes on once that is done, or earlier where something may have happened.
 """
 
 from __future__ import annotations
@@ -11,13 +11,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from clamber import _core
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.trajectory import Trajectory
 
 BLEND = 0.3  # [s] back to a trajectory that was left
+AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 
-Ticks = Iterator[None]
+Actions = Iterator[None]
 
 
 class Reference:
@@ -25,119 +27,100 @@ class Reference:
 
     Attributes:
         trajectory: That is followed.
-        i: The sample of it that was reached.
-        q: (nq,); velocity: (na,) of the joints; torque: (na,) fed forward.
-        closed: (nS,) bool, contacts by surface.
+        track: The rows that are being followed: `q` (nq,), `velocity` and `torque`
+            (na,) of the joints, `closed` (nS,) contacts, as of the last step.
         left_plan: Something else than the first trajectory was followed.
     """
 
     def __init__(self, trajectory: Trajectory, world: World) -> None:
         """Begin with the first sample."""
         self._kin, self._dadr = Kinematics(world), world.dadr
-        self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        self.left_plan = False
+        nq, surfaces = world.model.nq, len(world.surfaces)
+        self.track = _core.Track(nq, len(self._dadr), surfaces)
+        self._rows: list[tuple[np.ndarray, ...]] = []  # of the track, less q
+        self._steps: list[int] = []  # that each of them was followed
+        self.left_plan, self._way = False, 0
         self.follow(trajectory, 0)
-        self.set(trajectory, 0)
+        self._load(trajectory, np.zeros(1, dtype=int))
+        self.track.advance()
+        self._rows.clear()
+
+    @property
+    def i(self) -> int:
+        """The sample of the trajectory that was reached."""
+        return self._begin + self._way * self.track.done
 
     def follow(self, trajectory: Trajectory, i: int) -> None:
         """Go on from sample `i` of another trajectory."""
-        self.trajectory, self.i = trajectory, i
+        self.trajectory, self._begin, self._way = trajectory, i, 0
         self._offset: tuple[np.ndarray, np.ndarray, int] | None = None
 
-    def set(self, t: Trajectory, i: int) -> None:
-        """Be at sample `i` of a trajectory."""
-        self.q, self.torque = t.q[i], t.tau[i]
-        self.velocity, self.closed = t.v[i][self._dadr], t.contact[i]
-
-    def play(self, to: int, until: Callable[[], bool] | None = None) -> Ticks:
+    def play(self, to: int, until: Callable[[], bool] | None = None) -> Actions:
         """Follow the trajectory to sample `to`, or until something happens."""
-        while self.i < to:
-            if until is not None and until():
-                return
-            self.i += 1
-            self.set(self.trajectory, self.i)
-            self._blend()
+        if self.i < to and not (until is not None and until()):
+            self._load(self.trajectory, np.arange(self.i + 1, to + 1), way=1)
             yield
+            while self.i < to and not (until is not None and until()):
+                yield
 
-    def back(self, to: int) -> Ticks:
+    def back(self, to: int) -> Actions:
         """Follow the trajectory back to sample `to`."""
         self.left_plan = True
-        while self.i > to:
-            self.i -= 1
-            self.set(self.trajectory, self.i)
-            self.velocity = -self.velocity
-            yield
+        if self.i > to:
+            rows = np.arange(to, self.i)[::-1]
+            self._load(self.trajectory, rows, way=-1, speed=-1.0)
+            yield from self._done()
 
-    def aside(self, t: Trajectory, until: Callable[[], bool]) -> Ticks:
+    def aside(self, t: Trajectory, until: Callable[[], bool]) -> Actions:
         """Follow another trajectory until something happens, or there and back."""
         self.left_plan = True
-        for i in range(len(t.time)):
-            self.set(t, i)
+        rows = np.arange(len(t.time))
+        self._load(t, rows)
+        for _ in self._done():
             yield
             if until():
-                self.stand()
                 return
-        for i in reversed(range(len(t.time))):
-            self.set(t, i)
-            self.velocity = -self.velocity
-            yield
+        self._load(t, rows[::-1], speed=-1.0)
+        yield from self._done()
 
-    def rest(self, seconds: float) -> Ticks:
-        """Stand still."""
+    def rest(self, seconds: float) -> Actions:
+        """Stand still; the trajectory is left."""
         self.left_plan = True
-        self.stand()
-        for _ in range(round(seconds / PHYSICS_STEP)):
-            yield
+        yield from self.hold(seconds)
 
-    def stand(self) -> None:
-        """Have no velocity from here on."""
-        self.velocity = np.zeros(len(self._dadr))
+    def hold(self, seconds: float) -> Actions:
+        """Stand still."""
+        track, steps = self.track, round(seconds / PHYSICS_STEP)
+        row = (np.zeros(len(self._dadr)), track.torque, track.closed)
+        ahead = self._ahead(np.array([self.i]))
+        self._begin_rows(track.q, *row, ahead, steps=steps, way=0)
+        yield from self._done()
 
     def resume(self) -> None:
         """Back to the trajectory that was left, little by little while it goes on."""
-        t, i = self.trajectory, self.i
-        self._offset = self._kin.difference(t.q[i], self.q), self.torque - t.tau[i], 0
+        t, i, track = self.trajectory, self.i, self.track
+        offset = self._kin.difference(t.q[i], track.q)
+        self._offset = offset, track.torque - t.tau[i], i + 1
 
-    def _blend(self) -> None:
-        """Add what is left of the way back."""
-        if self._offset is None:
-            return
-        offset, torque, k = self._offset
-        n = round(BLEND / PHYSICS_STEP)
-        share = 0.5 + 0.5 * np.cos(np.pi * k / n)
-        rate = -0.5 * np.pi / BLEND * np.sin(np.pi * k / n)
-        self.q = self._kin.integrate(self.q, share * offset)
-        self.torque = self.torque + share * torque
-        self.velocity = self.velocity + rate * offset[self._dadr]
-        self._offset = (offset, torque, k + 1) if k < n else None
-
-    def closed_ahead(self, seconds: float) -> np.ndarray:
-        """(nS,) bool, contacts so much later."""
-        t = self.trajectory
-        return t.contact[min(self.i + round(seconds / PHYSICS_STEP), len(t.time) - 1)]
-
-    def record(self, q: np.ndarray) -> None:
-        """Keep what was commanded: posture `q` (nq,), the rest as set."""
-        v = np.zeros(self._kin.world.model.nv)
-        v[self._dadr] = self.velocity
-        self._rows.append((q, v, self.torque, self.closed))
-
-    @property
-    def seconds(self) -> float:
-        """Time of the last command that was kept [s]."""
-        return (len(self._rows) - 1) * PHYSICS_STEP
-
-    def followed(self, keyframes: np.ndarray) -> Trajectory | None:
+    def followed(self, q: np.ndarray, keyframes: np.ndarray) -> Trajectory | None:
         """What was commanded, where that is not the first trajectory.
 
         Velocities are those of joints only.
 
         Args:
+            q: (n, nq) postures as they were commanded.
             keyframes: (K,) when keyframes were reached [s].
         """
         if not self.left_plan:
             return None
-        q, v, tau, contact = (np.array(x) for x in zip(*self._rows, strict=True))
+        steps = [*self._steps, self.track.done]
+        rows = [
+            [np.resize(x, (n, x.shape[-1])) if len(x) < n else x[:n] for x in row]
+            for row, n in zip(self._rows, steps, strict=True)
+        ]
+        velocity, tau, contact = (np.concatenate(x) for x in zip(*rows, strict=True))
+        v = np.zeros((len(q), self._kin.world.model.nv))
+        v[:, self._dadr] = velocity
         return replace(
             self.trajectory,
             time=np.arange(len(q)) * PHYSICS_STEP,
@@ -148,3 +131,57 @@ class Reference:
             keyframes=keyframes,
             segments=(),
         )
+
+    def _load(
+        self, t: Trajectory, rows: np.ndarray, *, way: int = 0, speed: float = 1.0
+    ) -> None:
+        """Follow samples of a trajectory from the next step on.
+
+        Args:
+            t: The trajectory.
+            rows: (n,) samples of it, one after the other.
+            way: By how much each takes the trajectory at hand on.
+            speed: Factor on velocities.
+        """
+        q, torque = t.q[rows], t.tau[rows]
+        velocity = speed * t.v[rows][:, self._dadr]
+        at = self.i + way * np.arange(1, len(rows) + 1)
+        if self._offset is not None and way == 1:
+            self._blend(at - self._offset[2], q, velocity, torque)
+        ahead = self._ahead(at)
+        self._begin_rows(q, velocity, torque, t.contact[rows], ahead, way=way)
+
+    def _begin_rows(
+        self, q: np.ndarray, *rows: np.ndarray, way: int, steps: int = 0
+    ) -> None:
+        self._begin, self._way = self.i, way
+        if self._rows:
+            self._steps.append(self.track.done)
+        q, *rows = (np.array(x, ndmin=2) for x in (q, *rows))
+        self.track.load(q, *rows, steps or len(q))
+        self._rows.append(tuple(rows[:3]))
+
+    def _done(self) -> Actions:
+        """Until what was begun is done."""
+        while self.track.left:
+            yield
+
+    def _ahead(self, at: np.ndarray) -> np.ndarray:
+        """(n, nS) bool, contacts a little later than at samples (n,)."""
+        contact = self.trajectory.contact
+        return contact[np.minimum(at + round(AHEAD / PHYSICS_STEP), len(contact) - 1)]
+
+    def _blend(
+        self, k: np.ndarray, q: np.ndarray, velocity: np.ndarray, torque: np.ndarray
+    ) -> None:
+        """Add what is left of the way back, `k` (n,) steps after its begin, to rows."""
+        assert self._offset is not None
+        offset, push, _ = self._offset
+        n = round(BLEND / PHYSICS_STEP)
+        k = k[k <= n]
+        share = 0.5 + 0.5 * np.cos(np.pi * k / n)
+        rate = -0.5 * np.pi / BLEND * np.sin(np.pi * k / n)
+        for row, s in zip(q, share, strict=False):
+            row[:] = self._kin.integrate(row, s * offset)
+        torque[: len(k)] += share[:, None] * push
+        velocity[: len(k)] += rate[:, None] * offset[self._dadr]

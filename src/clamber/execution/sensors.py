@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber import _core
 from clamber.model.records import short_repr
 from clamber.model.world import PHYSICS_STEP, World
 
@@ -41,7 +42,12 @@ class Measurement:
 
 
 class Sensors:
-    """Reads the state of a simulation through noise and delay."""
+    """Reads the state of a simulation through noise and delay.
+
+    Attributes:
+        core: Reads; its noise must be drawn anew after `BLOCK` steps.
+        forces: Those of the contacts.
+    """
 
     def __init__(
         self, world: World, *, noise: float, delay: float, rng: np.random.Generator
@@ -54,98 +60,42 @@ class Sensors:
             delay: From sensing to use [s]; whole physics steps.
             rng: Of the noise.
         """
-        m = world.model
-        self._model = m
-        self._noise, self._rng = noise, rng
-        self._qadr = world.qadr
-        self._row = rows_of_geoms(world)
-        self._surfaces = len(world.surfaces)
-        self._late = round(delay / PHYSICS_STEP)
-        self._ring: list[Measurement] = []
+        self._nq, self._surfaces = world.model.nq, len(world.surfaces)
+        self._noise, self._rng, self._qadr = noise, rng, world.qadr
         self._k = 0
-        self._force = np.zeros((self._surfaces, 3))
-        self._off = np.zeros((BLOCK, m.nq))  # of base's place and joints
+        self.core = _core.Sensors(
+            nq=self._nq,
+            surfaces=self._surfaces,
+            late=round(delay / PHYSICS_STEP),
+            force_stride=FORCE_STRIDE,
+            block=BLOCK,
+        )
+        self.forces = contact_forces(world)
+
+    def draw(self) -> None:
+        """The noise of the next `BLOCK` steps."""
+        normal, n = self._rng.normal, BLOCK // FORCE_STRIDE + 1
+        offset = np.zeros((BLOCK, self._nq))
+        offset[:, self._qadr] = normal(0.0, ANGLE_NOISE, (BLOCK, len(self._qadr)))
+        offset[:, :3] = normal(0.0, POSITION_NOISE, (BLOCK, 3))
+        tilt = normal(0.0, ROTATION_NOISE, (BLOCK, 3))
+        pull = normal(0.0, FORCE_NOISE, (n, self._surfaces, 3))
+        gain = normal(0.0, FORCE_SCALE_NOISE, (n, self._surfaces))
+        self.core.draw(*(self._noise * x for x in (offset, tilt, gain, pull)))
 
     def read(self, data: mujoco.MjData) -> Measurement:
         """What is known at this physics step; call once for each."""
-        i = self._k % BLOCK
-        if i == 0:
-            angle = self._rng.normal(0.0, ANGLE_NOISE, (BLOCK, len(self._qadr)))
-            self._off[:, self._qadr] = self._noise * angle
-            self._off[:, :3] = self._noise * self._rng.normal(
-                0.0, POSITION_NOISE, (BLOCK, 3)
-            )
-            self._tilt = self._noise * self._rng.normal(0.0, ROTATION_NOISE, (BLOCK, 3))
-            n = BLOCK // FORCE_STRIDE + 1
-            self._pull = self._rng.normal(0.0, FORCE_NOISE, (n, self._surfaces, 3))
-            self._gain = self._rng.normal(
-                0.0, FORCE_SCALE_NOISE, (n, self._surfaces, 1)
-            )
-        q = data.qpos + self._off[i]
-        if self._noise > 0:
-            mujoco.mju_quatIntegrate(q[3:7], self._tilt[i], 1.0)
-        if self._k % FORCE_STRIDE == 0:
-            j = i // FORCE_STRIDE
-            f = surface_forces(data, self._row, self._surfaces)
-            self._force = (
-                f * (1.0 + self._noise * self._gain[j]) + self._noise * self._pull[j]
-            )
+        if self._k % BLOCK == 0:
+            self.draw()
         self._k += 1
-        now = Measurement(q, self._force)
-        if self._late == 0:
-            return now
-        if len(self._ring) <= self._late:
-            self._ring.append(now)
-            return self._ring[0]
-        slot = (self._k - 1) % (self._late + 1)
-        self._ring[slot] = now
-        return self._ring[self._k % (self._late + 1)]
+        self.forces.update(data)
+        return Measurement(*self.core.read(data.qpos, self.forces.surface))
 
 
-def rows_of_geoms(world: World) -> np.ndarray:
-    """(ngeom,) the index of a geom's surface; -1: of another link; -2: of the scene."""
+def contact_forces(world: World) -> _core.ContactForces:
+    """Of the scene on the robot, by its surfaces in order."""
     m = world.model
-    out = np.where(m.body_weldid[m.geom_bodyid] == 0, -2, -1)
+    rows = np.where(m.body_weldid[m.geom_bodyid] == 0, _core.SCENE, _core.OTHER)
     for i, surface in enumerate(world.surfaces.values()):
-        out[list(surface.geoms)] = i
-    return out
-
-
-def contact_forces(
-    data: mujoco.MjData, row_of_geom: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Contacts of the robot with the scene, and the force of each on the robot.
-
-    Elliptic cones: the rows of a contact begin with its normal force, then the two
-    tangential ones, along the axes of its frame.
-
-    Args:
-        data: After a step.
-        row_of_geom: (ngeom,) as `rows_of_geoms` gives it.
-
-    Returns:
-        (k, 2) geoms of the robot and of the scene, (k,) normal forces [N] and (k, 3)
-        forces on the robot in the world [N].
-    """
-    if data.ncon == 0:
-        return np.zeros((0, 2), dtype=int), np.zeros(0), np.zeros((0, 3))
-    c = data.contact
-    of_scene = row_of_geom[c.geom] == -2
-    use = (c.efc_address >= 0) & (of_scene[:, 0] != of_scene[:, 1])
-    address, frame = c.efc_address[use], c.frame[use].reshape(-1, 3, 3)
-    f = data.efc_force[address[:, None] + np.arange(3)]
-    second = of_scene[use, 0]  # the force acts on the second geom
-    sign = np.where(second, 1.0, -1.0)[:, None]
-    geoms = np.where(second[:, None], c.geom[use][:, ::-1], c.geom[use])
-    return geoms, f[:, 0], sign * np.einsum("ij,ijk->ik", f, frame)
-
-
-def surface_forces(
-    data: mujoco.MjData, row_of_geom: np.ndarray, surfaces: int
-) -> np.ndarray:
-    """(surfaces, 3) forces of the scene on each surface, of that many [N], world."""
-    geoms, _, force = contact_forces(data, row_of_geom)
-    row = row_of_geom[geoms[:, 0]]
-    out = np.zeros((surfaces, 3))
-    np.add.at(out, row[row >= 0], force[row >= 0])
-    return out
+        rows[list(surface.geoms)] = i
+    return _core.ContactForces(rows.tolist(), len(world.surfaces))

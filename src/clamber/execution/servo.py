@@ -16,13 +16,13 @@ what is left to it is its feed-forward torque and its damping.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
 import mujoco
 import numpy as np
 
+from clamber import _core
 from clamber.model.world import PHYSICS_STEP, World, chain_up, recompiled
 
 ControlMode = Literal["pid", "mixed"]
@@ -49,86 +49,36 @@ def driven_world(world: World, mode: ControlMode) -> World:
     return replace(recompiled(world, soften, robot), robot=world.robot)
 
 
-class JointServo:
+def joint_servo(world: World) -> _core.JointServo:
     """The law above for all joints of a world, with its integral."""
-
-    def __init__(self, world: World) -> None:
-        """Precompute all that does not depend on the state."""
-        self._kp = world.kp
-        self._damping = world.kd + world.model.dof_damping[world.dadr]
-        self._ki = world.ki
-        self._limit = np.divide(
-            INTEGRAL_LIMIT, world.ki, out=np.zeros_like(world.ki), where=world.ki > 0
-        )
-        self._integral = np.zeros(len(world.kp))
-
-    def command(
-        self,
-        reference: np.ndarray,
-        velocity: np.ndarray,
-        torque: np.ndarray,
-        measured: np.ndarray,
-        follow: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """(na,) servo command of one physics step.
-
-        Args:
-            reference: (na,) joint angles [rad].
-            velocity: (na,) joint velocities [rad/s].
-            torque: (na,) feed-forward [N m].
-            measured: (na,) joint angles as sensed [rad].
-            follow: (na,) in [0, 1], the share to which a joint positions itself: at 1
-                its reference is its measured angle (4.32).
-        """
-        error = reference - measured
-        if follow is not None:
-            reference = reference - follow * error
-            velocity = (1.0 - follow) * velocity
-            error = (1.0 - follow) * error
-        self._integral += error * PHYSICS_STEP
-        np.maximum(self._integral, -self._limit, out=self._integral)
-        np.minimum(self._integral, self._limit, out=self._integral)
-        push = self._damping * velocity + torque + self._ki * self._integral
-        return reference + push / self._kp
+    limit = np.zeros_like(world.ki)
+    np.divide(INTEGRAL_LIMIT, world.ki, out=limit, where=world.ki > 0)
+    return _core.JointServo(
+        kp=world.kp.tolist(),
+        damping=(world.kd + world.model.dof_damping[world.dadr]).tolist(),
+        ki=world.ki.tolist(),
+        limit=limit.tolist(),
+        dt=PHYSICS_STEP,
+    )
 
 
-class SelfPositioning:
+def self_positioning(world: World) -> _core.SelfPositioning:
     """The share to which ankles of planted feet position themselves (4.32).
 
-    From when both arms are loaded until a foot must step again; eased in and out.
+    From when both arms are loaded until a foot must step again; eased in and out. Of
+    the joints that the robot's description says so of.
     """
-
-    def __init__(self, world: World) -> None:
-        """Of the joints that the robot's description says so of."""
-        surfaces, robot = list(world.surfaces), world.robot
-        self._arms = [
-            [surfaces.index(s) for s in limb.surfaces]
-            for limb in robot.limbs.values()
-            if limb.is_arm
-        ]
-        ankles = self_positioning_joints(world)
-        self._ankles = [(surfaces.index(s), joints) for s, joints in ankles.items()]
-        self._share = np.zeros(len(world.joints))
-
-    def share(
-        self, loaded: Sequence[bool], closed: np.ndarray, ahead: np.ndarray
-    ) -> np.ndarray | None:
-        """(na,) in [0, 1], one physics step later; None where no joint ever does.
-
-        Args:
-            loaded: (nS,) surfaces that are loaded.
-            closed: (nS,) bool, contacts now.
-            ahead: (nS,) bool, contacts a little later.
-        """
-        if not self._ankles:
-            return None
-        on_arms = all(any(loaded[i] for i in rows) for rows in self._arms)
-        rate = PHYSICS_STEP / EASING
-        for row, joints in self._ankles:
-            free = on_arms and closed[row] and ahead[row]
-            share = float(self._share[joints][0]) + (rate if free else -rate)
-            self._share[joints] = min(max(share, 0.0), 1.0)
-        return self._share
+    surfaces, limbs = list(world.surfaces), world.robot.limbs.values()
+    ankles = self_positioning_joints(world)
+    return _core.SelfPositioning(
+        arms=[[surfaces.index(s) for s in x.surfaces] for x in limbs if x.is_arm],
+        ankles=[
+            (surfaces.index(foot), np.flatnonzero(joints).tolist())
+            for foot, joints in ankles.items()
+        ],
+        joints=len(world.joints),
+        rate=PHYSICS_STEP / EASING,
+    )
 
 
 def self_positioning_joints(world: World) -> dict[str, np.ndarray]:

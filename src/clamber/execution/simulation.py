@@ -12,27 +12,23 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber import _core
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Event, Stopped
 from clamber.execution.executive import Executive, OpenLoop
 from clamber.execution.perturbed import perturbed_world, push_of
-from clamber.execution.sensors import (
-    Sensors,
-    contact_forces,
-    rows_of_geoms,
-)
+from clamber.execution.sensors import BLOCK, Sensors
 from clamber.execution.servo import ControlMode, driven_world
 from clamber.model.records import short_repr
 from clamber.model.scene import Scene
-from clamber.model.se3 import upward
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
 
 STRIDE = 10  # physics steps between two recorded states
 END = 1.0  # [s] at the end that every step of is recorded
-FALLEN_TILT = np.radians(45.0)  # pelvis against its reference: it has fallen
+FALLEN_TILT = float(np.radians(45.0))  # pelvis against its reference: it has fallen
 FALLEN_HEIGHT = 0.20  # [m]
 DEFAULT_CONTROLLER: ControlMode = "mixed"
 
@@ -131,113 +127,52 @@ def simulate(
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
     push = push_of(d, float(plan.trajectory.time[-1]))
     report = progress or (lambda stage, share, note: None)
-    model, log = world.model, _Log(world)
+    model = world.model
     data = mujoco.MjData(model)
     data.qpos[:] = world.home if plan.state is None else plan.state.q
-    ctrl, speed = [], []
-    tail = round(END / PHYSICS_STEP)
-    order = np.array([model.actuator(j).id for j in world.joints])
-    fell, k = False, 0
-    while not fell:
-        first = k % STRIDE == 0
-        if first:
-            log.state(data)
-        row = np.zeros(model.nu)
-        row[order] = follower.command(sensors.read(data))
-        ctrl.append(row)
-        data.ctrl[:] = row
-        if push is not None:
-            data.xfrc_applied[world.base, :3] = push[k] if k < len(push) else 0.0
-        mujoco.mj_step(model, data)
-        end = follower.left < tail
-        if data.ncon:
-            log.depth[-1] = max(log.depth[-1], -float(data.contact.dist.min()))
-        if end:
-            speed.append(float(np.linalg.norm(data.qvel[:3])))
-        if first or end:
-            log.contacts(data, k)
-        if first:
-            log.effort.append(data.actuator_force.copy())
-            fell = has_fallen(data.qpos, follower.reference)
-        if k % 1000 == 0:
-            share = min(k / max(len(plan.trajectory.time), k + follower.left), 1.0)
-            report("simulate", share, f"{k * PHYSICS_STEP:.0f} s")
-        k += 1
-        if follower.left == 0:
-            break
+    loop = _core.Loop(
+        data,
+        follower.core,
+        sensors.core,
+        sensors.forces,
+        order=[model.actuator(j).id for j in world.joints],
+        base=world.base,
+        stride=STRIDE,
+        tail=round(END / PHYSICS_STEP),
+        tilt=FALLEN_TILT,
+        height=FALLEN_HEIGHT,
+        push=push,
+    )
+    runs = True
+    while runs:
+        k = loop.count
+        share = min(k / max(len(plan.trajectory.time), k + follower.left), 1.0)
+        report("simulate", share, f"{k * PHYSICS_STEP:.0f} s")
+        sensors.draw()
+        for _ in range(BLOCK):
+            runs = loop.step(follower)
+            if not runs:
+                break
+            mujoco.mj_step(model, data)
     report("simulate", 1.0, "")
+    recorded = loop.recorded()
     return Rollout(
         world=world,
-        ctrl=np.array(ctrl),
         stride=STRIDE,
-        **log.arrays(),
+        time=np.arange(len(recorded["qpos"])) * STRIDE * PHYSICS_STEP,
+        **recorded,
         surfaces=tuple(world.surfaces),
-        end_speed=np.array(speed),
-        push=None if push is None else _padded(push, k),
+        push=None if push is None else _padded(push, loop.count),
         followed=follower.followed,
         events=tuple(follower.events),
-        fell=fell,
+        fell=loop.fell,
         rests_on=follower.rests_on,
     )
 
 
-class _Log:
-    """What is recorded of states and contacts."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._row = rows_of_geoms(world)
-        self.qpos, self.qvel, self.effort = [], [], []
-        self.depth: list[float] = []
-        self._steps: list[np.ndarray] = []
-        self._contacts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-
-    def state(self, data: mujoco.MjData) -> None:
-        """Before a step."""
-        self.qpos.append(data.qpos.copy())
-        self.qvel.append(data.qvel.copy())
-        self.depth.append(0.0)
-
-    def contacts(self, data: mujoco.MjData, k: int) -> None:
-        """After step `k`."""
-        found = contact_forces(data, self._row)
-        self._steps.append(np.full(len(found[0]), k))
-        self._contacts.append(found)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """By the names of a rollout."""
-        states, surfaces = len(self.qpos), len(self._world.surfaces)
-        step = np.concatenate(self._steps)
-        geoms, normal, force = (
-            np.concatenate(x) for x in zip(*self._contacts, strict=True)
-        )
-        row = self._row[geoms[:, 0]]
-        # Sums over the contacts of each recorded state, in their order.
-        on = (step % STRIDE == 0) & (row >= 0)
-        by_surface = np.zeros((states, surfaces, 3))
-        np.add.at(by_surface, (step[on] // STRIDE, row[on]), force[on])
-        other = (step % STRIDE == 0) & (row < 0)
-        unintended = np.bincount(
-            step[other] // STRIDE, weights=normal[other], minlength=states
-        )
-        return {
-            "time": np.arange(states) * STRIDE * PHYSICS_STEP,
-            "qpos": np.array(self.qpos),
-            "qvel": np.array(self.qvel),
-            "actuator_force": np.array(self.effort),
-            "contact_force": by_surface,
-            "unintended": unintended.astype(float),
-            "penetration": np.array(self.depth),
-            "contact_step": step.astype(np.int32),
-            "contact_geoms": geoms.astype(np.int16),
-            "contact_load": np.column_stack([normal, force[:, 2]]),
-        }
-
-
 def has_fallen(q: np.ndarray, reference: np.ndarray) -> bool:
     """The pelvis has tilted or sunk far from its reference: the run need not go on."""
-    tilt = np.arccos(np.clip(upward(q[3:7]) @ upward(reference[3:7]), -1.0, 1.0))
-    return bool(tilt > FALLEN_TILT or q[2] < reference[2] - FALLEN_HEIGHT)
+    return _core.has_fallen(q, reference, FALLEN_TILT, FALLEN_HEIGHT)
 
 
 def _padded(x: np.ndarray, n: int) -> np.ndarray:
