@@ -100,3 +100,183 @@ def is_statically_stable(
     com: np.ndarray,
 ) -> bool:
     """Whether forces within the friction cones balance gravity."""
+# What is done at every physics step.
+
+SCENE: int
+OTHER: int
+
+class JointServo:
+    """PID with feed-forward as commands of joint servos, with its integral."""
+
+    def __init__(
+        self,
+        *,
+        kp: list[float],
+        damping: list[float],
+        ki: list[float],
+        limit: list[float],
+        dt: float,
+    ) -> None:
+        """Of na joints; `limit` of the integral [rad s], `dt` of a step [s]."""
+
+    def command(
+        self,
+        reference: np.ndarray,
+        velocity: np.ndarray,
+        torque: np.ndarray,
+        measured: np.ndarray,
+        follow: np.ndarray,
+    ) -> np.ndarray:
+        """(na,) of one step; `follow` in [0, 1]: the joint's reference is its angle."""
+
+class SelfPositioning:
+    """The share to which ankles of planted feet position themselves."""
+
+    def __init__(
+        self,
+        *,
+        arms: list[list[int]],
+        ankles: list[tuple[int, list[int]]],
+        joints: int,
+        rate: float,
+    ) -> None:
+        """Surfaces of each arm; of each foot, with its joints; change per step."""
+
+    def share(
+        self, loaded: np.ndarray, closed: np.ndarray, ahead: np.ndarray
+    ) -> np.ndarray:
+        """(na,) one step later; flags (nS,): loaded, in contact now, and soon."""
+
+class Filter:
+    """Low passes of the measured configuration and forces."""
+
+    q: np.ndarray
+    load: np.ndarray
+
+    def __init__(
+        self, q: list[float], surfaces: int, *, pose_share: float, force_share: float
+    ) -> None:
+        """Begin at `q`, nothing loaded; the share of what is new in each step."""
+
+    def update(self, q: np.ndarray, force: np.ndarray) -> None:
+        """Take in one step's measurement."""
+
+    def watch(self, surfaces: list[int], normals: np.ndarray, pressed: float) -> None:
+        """Have a controller decide where a surface is pressed along its normal [N]."""
+
+class Track:
+    """Rows of a reference, one for each step; the present one."""
+
+    q: np.ndarray
+    velocity: np.ndarray
+    torque: np.ndarray
+    closed: np.ndarray
+    ahead: np.ndarray
+    done: int
+    left: int
+
+    def __init__(self, nq: int, joints: int, surfaces: int) -> None:
+        """No rows as yet."""
+
+    def load(
+        self,
+        q: np.ndarray,
+        velocity: np.ndarray,
+        torque: np.ndarray,
+        closed: np.ndarray,
+        ahead: np.ndarray,
+        steps: int,
+    ) -> None:
+        """Rows of the next steps; a single row is held for all of them."""
+
+    def advance(self) -> bool:
+        """Be at the next row; False where there is none."""
+
+class Follower:
+    """Filters, follows a track on servos, has its owner `decide` and `balance`."""
+
+    scale: float
+    ends: bool
+    steps: int
+    goal: np.ndarray
+    commanded: np.ndarray
+
+    def __init__(
+        self,
+        filter: Filter,
+        track: Track,
+        servo: JointServo,
+        ankles: SelfPositioning,
+        *,
+        qadr: list[int],
+        period: int,
+        touch: float,
+        shift_share: float,
+    ) -> None:
+        """`touch` [N] loads an arm; `shift_share` of a step eases `goal` in."""
+
+    def command(self, q: np.ndarray, force: np.ndarray, owner: object) -> np.ndarray:
+        """(na,) of one step, for what is measured."""
+
+class Sensors:
+    """Readings through noise and delay."""
+
+    def __init__(
+        self, *, nq: int, surfaces: int, late: int, force_stride: int, block: int
+    ) -> None:
+        """`late` steps; forces anew every `force_stride`; noise for `block` steps."""
+
+    def draw(
+        self, offset: np.ndarray, tilt: np.ndarray, gain: np.ndarray, pull: np.ndarray
+    ) -> None:
+        """(block, nq), (block, 3); of each reading of forces (n, nS), (n, nS, 3)."""
+
+    def read(
+        self, qpos: np.ndarray, force: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Configuration and forces (nS, 3) as they are known at this step."""
+
+class ContactForces:
+    """Contacts of the robot with the scene."""
+
+    surface: np.ndarray
+
+    def __init__(self, row_of_geom: list[int], surfaces: int) -> None:
+        """The index of each geom's surface, or `SCENE`, or `OTHER`."""
+
+    def update(self, data: object) -> None:
+        """Those of an `MjData` after a step: `surface` (nS, 3) is their sum [N]."""
+
+class Loop:
+    """The steps of a simulation, all but `mj_step` itself, and what is recorded."""
+
+    count: int
+    fell: bool
+
+    def __init__(
+        self,
+        data: object,
+        follower: Follower,
+        sensors: Sensors,
+        forces: ContactForces,
+        *,
+        order: list[int],
+        base: int,
+        stride: int,
+        tail: int,
+        tilt: float,
+        height: float,
+        push: np.ndarray | None,
+    ) -> None:
+        """Actuators of the joints; the last `tail` steps are recorded one by one."""
+
+    def step(self, owner: object) -> bool:
+        """All that is due before the next `mj_step`; False where there is none."""
+
+    def recorded(self) -> dict[str, np.ndarray]:
+        """What was recorded, by the names of a rollout; once."""
+
+def has_fallen(
+    q: np.ndarray, reference: np.ndarray, tilt: float, height: float
+) -> bool:
+    """The base has tilted [rad] or sunk [m] that far from its reference."""

@@ -166,6 +166,11 @@ nb::object taken(std::vector<T>&& values, std::vector<size_t> shape) {
     return nb::cast(nb::ndarray<nb::numpy, T>(kept->data(), shape.size(), shape.data(), owner));
 }
 
+struct OwnTrack : Track {  // keeps the arrays of its rows
+    using Track::Track;
+    nb::object rows;
+};
+
 // One controller: it filters what is measured and follows its track on its servos.
 //
 // `owner.decide(look)` is called where the rows are at their end, where a surface is
@@ -413,12 +418,7 @@ void bind_servo(nb::module_& m) {
             auto& f = nb::cast<Filter&>(self);
             return view(f.load.data(), {size_t(f.surfaces()), 3}, self);
         });
-    struct OwnTrack : Track {  // keeps the arrays of its rows
-        using Track::Track;
-        nb::object rows;
-    };
-    nb::class_<Track>(m, "BareTrack");
-    nb::class_<OwnTrack, Track>(m, "Track")
+    nb::class_<OwnTrack>(m, "Track")
         .def(nb::init<int, int, int>(), nb::arg("nq"), nb::arg("joints"), nb::arg("surfaces"))
         .def("load", [](OwnTrack& self, In q, In velocity, In torque, InBool closed,
                         InBool ahead, int steps) {
@@ -433,9 +433,9 @@ void bind_servo(nb::module_& m) {
                        int(n)}, steps);
             self.rows = nb::make_tuple(q, velocity, torque, closed, ahead);
         })
-        .def("advance", [](Track& self) { return self.advance(); })
-        .def_prop_ro("done", &Track::done)
-        .def_prop_ro("left", &Track::left)
+        .def("advance", [](OwnTrack& self) { return self.advance(); })
+        .def_prop_ro("done", [](OwnTrack& self) { return self.done(); })
+        .def_prop_ro("left", [](OwnTrack& self) { return self.left(); })
         .def_prop_ro("q", [](nb::handle_t<OwnTrack> self) {
             auto& t = nb::cast<OwnTrack&>(self);
             return view(t.q.data(), {t.q.size()}, self);
@@ -457,7 +457,7 @@ void bind_servo(nb::module_& m) {
             return view(reinterpret_cast<bool*>(t.ahead.data()), {t.ahead.size()}, self);
         });
     nb::class_<Follower>(m, "Follower")
-        .def(nb::init<Filter&, Track&, JointServo&, SelfPositioning&, std::vector<int>, int,
+        .def(nb::init<Filter&, OwnTrack&, JointServo&, SelfPositioning&, std::vector<int>, int,
                       double, double>(),
              nb::arg("filter"), nb::arg("track"), nb::arg("servo"), nb::arg("ankles"),
              nb::kw_only(), nb::arg("qadr"), nb::arg("period"), nb::arg("touch"),

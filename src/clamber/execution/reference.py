@@ -90,10 +90,11 @@ class Reference:
 
     def hold(self, seconds: float) -> Actions:
         """Stand still."""
-        track, steps = self.track, round(seconds / PHYSICS_STEP)
-        row = (np.zeros(len(self._dadr)), track.torque, track.closed)
+        steps, still = round(seconds / PHYSICS_STEP), np.zeros((1, len(self._dadr)))
+        now = self.track
+        q, torque, closed = (x[None].copy() for x in (now.q, now.torque, now.closed))
         ahead = self._ahead(np.array([self.i]))
-        self._begin_rows(track.q, *row, ahead, steps=steps, way=0)
+        self._begin_rows(q, still, torque, closed, ahead, way=0, steps=steps)
         yield from self._done()
 
     def resume(self) -> None:
@@ -149,17 +150,26 @@ class Reference:
         if self._offset is not None and way == 1:
             self._blend(at - self._offset[2], q, velocity, torque)
         ahead = self._ahead(at)
-        self._begin_rows(q, velocity, torque, t.contact[rows], ahead, way=way)
+        closed = t.contact[rows]
+        rest = {"way": way, "steps": len(rows)}
+        self._begin_rows(q, velocity, torque, closed, ahead, **rest)
 
     def _begin_rows(
-        self, q: np.ndarray, *rows: np.ndarray, way: int, steps: int = 0
+        self,
+        q: np.ndarray,
+        velocity: np.ndarray,
+        torque: np.ndarray,
+        closed: np.ndarray,
+        ahead: np.ndarray,
+        *,
+        way: int,
+        steps: int,
     ) -> None:
         self._begin, self._way = self.i, way
         if self._rows:
             self._steps.append(self.track.done)
-        q, *rows = (np.array(x, ndmin=2) for x in (q, *rows))
-        self.track.load(q, *rows, steps or len(q))
-        self._rows.append(tuple(rows[:3]))
+        self.track.load(q, velocity, torque, closed, ahead, steps)
+        self._rows.append((velocity, torque, closed))
 
     def _done(self) -> Actions:
         """Until what was begun is done."""
