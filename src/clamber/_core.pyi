@@ -247,6 +247,39 @@ class ContactForces:
     def update(self, data: object) -> None:
         """Those of an `MjData` after a step: `surface` (nS, 3) is their sum [N]."""
 
+class Balance:
+    """Where to move a centre of mass that is near the border of its support."""
+
+    shift: np.ndarray
+
+    def __init__(
+        self,
+        xpos: np.ndarray,
+        xmat: np.ndarray,
+        com: np.ndarray,
+        *,
+        high: float,
+        fade: float,
+        sag: float,
+        p: float,
+        d: float,
+        t: float,
+        most: float,
+        smoothing: float,
+        settled: float,
+        period: float,
+    ) -> None:
+        """Looks at links (nbody, 3), (nbody, 9) and centre of mass (3,) in place."""
+
+    def hold(self, bodies: list[int], local: np.ndarray, sole: np.ndarray) -> None:
+        """Points (n, 3) of links bear, each `sole` (n, 3) farther in the world."""
+
+    def measured(self) -> None:
+        """The links are where they were measured."""
+
+    def planned(self) -> bool:
+        """The links are where they were planned; whether to move by `shift` (2,)."""
+
 class Loop:
     """The steps of a simulation, all but `mj_step` itself, and what is recorded."""
 

@@ -16,15 +16,14 @@ was planned with, the robot is let alone.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
-from clamber.step.polygon import com_margin, support_polygon
 
 HIGH, FADE = 0.022, 0.008  # [m] margin at which feedback sets in, and within how much
 SAG = 0.003  # [m] less than the planned margin is no danger
@@ -45,10 +44,16 @@ class Balance:
 
     def __init__(self, world: World, period: float) -> None:
         """Feed back every `period` [s]."""
-        self._kin = Kinematics(world)
-        self._period = period
-        self._deviation = np.zeros(2)
-        self._integral = np.zeros(2)
+        self._kin = kin = Kinematics(world)
+        self._core = _core.Balance(
+            kin.data.xpos,
+            kin.data.xmat,
+            kin.com,
+            **{"high": HIGH, "fade": FADE, "sag": SAG, "p": P, "d": D, "t": T},
+            **{"most": MOST, "smoothing": RATE_SMOOTHING, "settled": SETTLED},
+            period=period,
+        )
+        self._contacts: Sequence[Contact] = ()
         self.goal = np.zeros(len(world.dadr))
 
     def update(
@@ -61,32 +66,33 @@ class Balance:
             reference: (nq,) as planned.
             contacts: That the plan has closed, loaded or not.
         """
-        kin, dt = self._kin, self._period
+        kin = self._kin
         if not contacts:
             return
-        now, points, margin = self._seen(q, contacts)
-        planned, places, meant = self._seen(reference, contacts)
-        # The contacts may be turned from where they were planned, all together.
-        c = float(np.sum(points * places))
-        s = float(np.sum(points[:, 0] * places[:, 1] - points[:, 1] * places[:, 0]))
-        n = math.hypot(c, s)
-        c, s = (c / n, s / n) if n > 0 else (1.0, 0.0)
-        e = np.array([c * now[0] - s * now[1], s * now[0] + c * now[1]]) - planned
-        rate = (e - self._deviation) / (RATE_SMOOTHING + dt)
-        self._deviation = self._deviation + dt * rate
-        e = self._deviation
-        w = float(np.clip((min(HIGH, meant - SAG) - margin) / FADE, 0.0, 1.0))
-        # Where it is not needed it fades.
-        self._integral -= dt / T * (w * e + (1.0 - w) * self._integral)
-        shift = self._integral - w * (P * e + D * rate)
-        for x in (self._integral, shift):
-            x *= MOST / max(float(np.linalg.norm(x)), MOST)
-        if w == 0.0 and np.linalg.norm(self._integral) < SETTLED:
-            self._integral[:] = 0.0
-            self.goal[:] = 0.0
-            return
+        if contacts is not self._contacts:
+            self._hold(contacts)
+        kin.update(q)
+        self._core.measured()
+        kin.update(reference)
+        self.goal[:] = self._moved() if self._core.planned() else 0.0
+
+    def _hold(self, contacts: Sequence[Contact]) -> None:
+        """These bear from here on."""
+        world, bodies, local, sole = self._kin.world, [], [], []
+        for c in contacts:
+            s = world.surface(c.surface, c.edge)
+            bodies += [s.body] * len(s.corners)
+            local.append(s.corners)
+            down = -s.radius * world.supports[c.support].normal
+            sole.append(np.tile(down, (len(s.corners), 1)))
+        self._core.hold(bodies, np.concatenate(local), np.concatenate(sole))
+        self._contacts = contacts
+
+    def _moved(self) -> np.ndarray:
+        """(na,) that moves the centre of mass as is asked for, the contacts held."""
+        kin = self._kin
         rows = [kin.com_jacobian()[:2].copy()]
-        for contact in contacts:
+        for contact in self._contacts:
             n = kin.world.supports[contact.support].normal
             surface = kin.world.surface(contact.surface, contact.edge)
             p = kin.contact_point(contact.surface, n, contact.edge)
@@ -96,22 +102,6 @@ class Balance:
                 rows.append(angular.copy())
         A = np.vstack(rows)
         wanted = np.zeros(len(A))
-        wanted[:2] = shift
+        wanted[:2] = self._core.shift
         y = np.linalg.solve(A @ A.T + DAMPING * np.eye(len(A)), wanted)
-        self.goal[:] = (A.T @ y)[kin.world.dadr]
-
-    def _seen(
-        self, q: np.ndarray, contacts: Sequence[Contact]
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Centre of mass (2,), bearing points (K, 2), from their middle; margin."""
-        kin = self._kin
-        kin.update(q)
-        supports = kin.world.supports
-        points = np.vstack(
-            [
-                kin.bearing_points(c.surface, supports[c.support].normal, c.edge)
-                for c in contacts
-            ]
-        )[:, :2]
-        com, middle = kin.com[:2].copy(), points.mean(axis=0)
-        return com - middle, points - middle, com_margin(com, support_polygon(points))
+        return (A.T @ y)[kin.world.dadr]

@@ -182,9 +182,13 @@ class Executive:
         """Move the centre of mass from its reference where balance asks for it."""
         if not self._slow:  # in faster motion the robot need not balance statically
             return
-        now, track = self.estimate, self._ref.track
-        closed = self._at_hand.closed_contacts(track.closed, now.surfaces)
-        self._balance.update(now.q, track.q, closed)
+        track, closed = self._ref.track, self._ref.track.closed.tobytes()
+        if self._closed != (self._at_hand.change, closed):
+            self._closed = self._at_hand.change, closed
+            self._bearing = self._at_hand.closed_contacts(
+                track.closed, self.estimate.surfaces
+            )
+        self._balance.update(self.estimate.q, track.q, self._bearing)
         self.core.goal[:] = self._balance.goal
 
     @property
@@ -503,6 +507,8 @@ class Executive:
         self.estimate.believe(plan.world)
         self._ref.follow(trajectory, sample)
         self._at_hand = Progress(plan, trajectory)
+        self._bearing: list[Contact] = []  # contacts that are closed
+        self._closed: tuple[int, bytes] | None = None  # when, and of which surfaces
 
     def _note(self, kind: type[Event], **what: Any) -> None:
         self.events.append(kind(time=self.core.steps * PHYSICS_STEP, **what))
