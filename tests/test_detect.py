@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.signal import savgol_filter
 
 from clamber.contact.contact import DIRECTIONS, ContactInterval, ContactSequence
 from clamber.errors import InputError
@@ -24,6 +25,7 @@ from clamber.recording.detect import (
     detect_contacts,
     fit_instant,
     hysteresis,
+    local_quadratics,
     noise_of,
 )
 from support.climb import ClimbOptions, synthesize_climb
@@ -280,6 +282,14 @@ def test_hysteresis_begins_strict_and_lasts_while_loose():
     strict = np.array([0, 1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 0, 1, 0], dtype=bool)
     assert hysteresis(strict, loose, 2) == [(0, 2), (4, 8), (12, 14)]
     assert hysteresis(strict, loose, 3) == [(4, 8)]
+
+
+@pytest.mark.parametrize("n", [5, 25, 199])
+@pytest.mark.parametrize("order", [0, 1])
+def test_smoothing_is_that_of_savitzky_and_golay(rng, n, order):
+    x = np.cumsum(rng.normal(size=(200, 3, 2)), axis=0)
+    expected = savgol_filter(x, n, 2, deriv=order, axis=0)
+    assert np.allclose(local_quadratics(x, n, order), expected, atol=1e-11)
 
 
 def test_noise_is_measured_on_a_moving_track(rng):

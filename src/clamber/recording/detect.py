@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import correlate1d
 
 from clamber.contact.contact import (
     PARTS,
@@ -197,8 +198,6 @@ def detect_contacts(
 
 
 def _smooth(demo: Demonstration, scene: Scene, options: DetectOptions) -> _Tracks:
-    from scipy.signal import savgol_filter
-
     longest = (len(demo.t) - 1) // 2 * 2 + 1
     if longest < 5:
         raise InputError("five samples at least", demo.source, value=longest)
@@ -209,11 +208,35 @@ def _smooth(demo: Demonstration, scene: Scene, options: DetectOptions) -> _Track
 
     p, dt = demo.position, 1.0 / demo.rate
     n, short = samples(options.smoothing), samples(options.smoothing / 2)
-    velocity = np.asarray(savgol_filter(p, n, 2, deriv=1, delta=dt, axis=0))
-    position = np.asarray(savgol_filter(p, short, 2, axis=0))
+    velocity, position = local_quadratics(p, n, 1) / dt, local_quadratics(p, short, 0)
     speeds = np.linalg.norm(velocity, axis=2)
     noise = {n: noise_of(demo.point(n)) for n in demo.names}
     return _Tracks(demo, scene, options, position, speeds, noise)
+
+
+def local_quadratics(x: np.ndarray, n: int, order: int) -> np.ndarray:
+    """Tracks (T, ...), or their derivative by samples, smoothed (Savitzky-Golay).
+
+    Each value is that of the quadratic that fits the odd number `n` of samples around
+    it best; near the ends, that of the first or last `n`.
+
+    Args:
+        x: The tracks, T >= n.
+        n: Samples.
+        order: 0, or 1 for the derivative.
+    """
+    half = n // 2
+    powers = np.linspace(-1.0, 1.0, n)[:, None] ** np.arange(3)
+    fit = np.linalg.pinv(powers)  # coefficients of the quadratic, from the samples
+    slopes = np.column_stack([np.zeros(n), np.ones(n), 2.0 * powers[:, 1]])
+    at = (powers, slopes / half)[order] @ fit  # (n, n) values from the samples
+    out = correlate1d(x, at[half], axis=0, mode="constant")
+    for ends, rows in (
+        (slice(None, n), slice(half)),
+        (slice(-n, None), slice(-half, None)),
+    ):
+        out[ends][rows] = np.tensordot(at[rows], x[ends], axes=1)
+    return out
 
 
 def _evidence(demo: Demonstration) -> list[str]:
