@@ -100,6 +100,7 @@ def is_statically_stable(
     com: np.ndarray,
 ) -> bool:
     """Whether forces within the friction cones balance gravity."""
+
 # What is done at every physics step.
 
 SCENE: int
