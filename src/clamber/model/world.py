@@ -69,7 +69,7 @@ class Surface:
         return replace(self, centre=ends.mean(axis=0), corners=ends)
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True, weakref_slot=True)
 class World:
     """Robot and scene as one compiled model, with indices and limits.
 

@@ -89,7 +89,7 @@ def settle(
         ),
         Phase(
             kind="settle",
-            q=bridge(ik, here.q, key.q, now.stance, now.stance),
+            q=bridge(ik, here.q, key.q, now.stance),
             contacts=now.stance,
             load_before=now.loaded,
             load_after=now.stance,

@@ -21,49 +21,39 @@ Shapes: nv tangent dimensions, m rows of a task, P collision pairs of the world.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
-import daqp
 import numpy as np
 
+from clamber import _core
 from clamber.errors import Status
+from clamber.model.core import core_of
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
-from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.tasks import (
-    FAR,
-    Apart,
-    Balance,
-    Distance,
-    Over,
-    Reaching,
-    Rows,
     SurfaceTask,
-    Task,
-    Turned,
     leaning,
+    packed_pointing,
+    packed_tasks,
     pointing,
 )
 
-STEP_ROTATION = 0.15  # [rad] largest joint step of one iteration
-STEP_TRANSLATION = 0.08  # [m] largest step of the base
-RECOVERY_STEP = 0.05  # [m, rad] of a violation that one step is asked to make good
-ACTIVE_RANGE = 0.10  # [m] farther pairs have no row
-DAMPING = 2e-4  # mu
-NEAR_RANGE = 0.03  # [m] pairs this near always have a row
-SLOW = 0.01  # share of the merit; three steps that gain less end the solve
-MIN_RADIUS = 1e-3  # of the trust region, where the solve has stalled
-PENALTY = 1e6  # of violations against the soft cost, in the QP and in the merit
-CONTACT_TOL = 5e-4  # [m, rad] a contact is closed
-DISTANCE_TOL = 2e-3  # [m] a distance may fall short by this
-BALANCE_TOL = 2e-3  # [m]
-FURTHER_CLEARANCE = 0.004  # [m] a shin beside its knee, a forearm beside its elbow
+# The core's constants, where a reader of results needs them.
+STEP_ROTATION: float = _core.STEP_ROTATION  # [rad] largest joint step of an iteration
+STEP_TRANSLATION: float = _core.STEP_TRANSLATION  # [m] largest step of the base
+ACTIVE_RANGE: float = _core.ACTIVE_RANGE  # [m] farther pairs have no row
+DAMPING: float = _core.DAMPING  # mu
+PENALTY: float = _core.PENALTY  # of violations against the soft cost
+CONTACT_TOL: float = _core.CONTACT_TOL  # [m, rad] a contact is closed
+LIMIT_TOL: float = _core.LIMIT_TOL  # [rad] beyond a joint's limit
+DISTANCE_TOL: float = _core.DISTANCE_TOL  # [m] a distance may fall short by this
+BALANCE_TOL: float = _core.MARGIN_TOL  # [m]
+FURTHER_CLEARANCE: float = _core.FURTHER_CLEARANCE  # [m] a shin beside its knee
 # How much farther than its clearance a part stays from a support [m], by geom and name.
 ExtraClearance = Mapping[tuple[int, str], float]
 NO_EXTRA: ExtraClearance = MappingProxyType({})
-SOFT = 8  # daqp's type of a constraint that may give way
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -136,7 +126,7 @@ class Residuals:
     @property
     def status(self) -> Status:
         """The first thing that is wrong, or SOLVED."""
-        if self.contact > CONTACT_TOL or self.limits > 1e-6:
+        if self.contact > CONTACT_TOL or self.limits > LIMIT_TOL:
             return Status.UNREACHABLE
         if self.distance > DISTANCE_TOL:
             return Status.COLLIDING
@@ -210,20 +200,7 @@ class QP:
     A: np.ndarray
     lo: np.ndarray
     hi: np.ndarray
-    sense: np.ndarray
     merit: float
-
-    __repr__ = short_repr
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _Asked:
-    """A problem as tasks; `balance` is one of them only where it is asked for."""
-
-    problem: PostureProblem
-    tasks: list[Task]
-    balance: Balance
-    distance: Distance
 
     __repr__ = short_repr
 
@@ -232,7 +209,7 @@ class IK:
     """Workspace of the solver: one per world, used again for every posture."""
 
     def __init__(self, world: World, extra: ExtraClearance = NO_EXTRA) -> None:
-        """Allocate rows once.
+        """Allocate once.
 
         Args:
             world: Robot and scene.
@@ -240,120 +217,49 @@ class IK:
         """
         self.world, self.extra = world, extra
         self.kin = Kinematics(world)
-        nv = world.model.nv
-        self._rows = Rows(world)
-        self._step = np.full(nv, STEP_ROTATION)
-        self._step[:3] = STEP_TRANSLATION
-        self._joints = np.zeros(nv)
-        self._joints[world.dadr] = 1.0
-        self._dofs, self._angles = _as_slice(world.dadr), _as_slice(world.qadr)
-        self._q_min = np.maximum(world.q_min[world.dadr], -FAR)
-        self._q_max = np.minimum(world.q_max[world.dadr], FAR)
-        self._senses: dict[int, np.ndarray] = {}
         # What each pair keeps besides its clearance, and whether a part was told to.
-        self._rough = np.zeros(len(world.pairs))
+        rough = np.zeros(len(world.pairs))
+        told = np.zeros(len(world.pairs), dtype=np.uint8)
         for box in world.scene.boxes:
             of_box = world.pairs == world.support_geom[box.name]
-            self._rough[of_box.any(axis=1)] = box.roughness
-        self._told = np.zeros(len(world.pairs), dtype=bool)
+            rough[of_box.any(axis=1)] = box.roughness
         for (geom, support), more in extra.items():
             pair = geom, world.support_geom[support]
             mine = np.isin(world.pairs, pair).all(axis=1)
-            self._rough[mine] = np.maximum(self._rough[mine], more)
-            self._told |= mine
-        self._asked: _Asked | None = None
+            rough[mine] = np.maximum(rough[mine], more)
+            told |= mine
+        self._model = core_of(world)
+        self.core = _core.Workspace(self._model, rough, told)
+        # The last problem, as the core has it.
+        self._asked: tuple[PostureProblem, _core.Problem] | None = None
 
     def build(
         self, problem: PostureProblem, q: np.ndarray, reach: float = ACTIVE_RANGE
     ) -> QP:
-        """The QP at `q`; `Kinematics` of this workspace is left at `q`.
+        """The QP at `q`.
 
         Args:
             problem: What is wanted.
             q: (nq,).
             reach: Pairs farther apart than this have no row [m].
         """
-        merit = self._errors(problem, q, reach)
-        return self._linearise(problem, q, merit)
+        H, c, C, e, A, lo, hi, merit = self.core.build(self._ask(problem), q, reach)
+        return QP(H=H, c=c, C=C, e=e, A=A, lo=lo, hi=hi, merit=merit)
 
-    def _errors(self, problem: PostureProblem, q: np.ndarray, reach: float) -> float:
-        """The merit at `q`, and what all rows but their Jacobians hold there.
+    def step(
+        self, problem: PostureProblem, q: np.ndarray, radius: float = 1.0
+    ) -> np.ndarray:
+        """The step (nv,) that the QP at `q` asks for.
 
-        A third of the configurations that a solve looks at are judged by it alone: they
-        are taken back, or the last.
-        """
-        self.kin.update(q)
-        rows = self._rows
-        rows.clear(reach)
-        for task in self._ask(problem).tasks:
-            task.add(self.kin, rows)
-        e = rows.soft.lo[: rows.soft.n]
-        cost = 0.5 * float(e @ e)
-        weight = problem.posture_weight**2
-        if weight > 0:
-            off = q[self._angles] - problem.q_reference[self._angles]
-            cost += 0.5 * weight * float(off @ off)
-        return cost + 0.5 * PENALTY * rows.violation
-
-    def _linearise(self, problem: PostureProblem, q: np.ndarray, merit: float) -> QP:
-        """The QP where `_errors` has just been asked for."""
-        self._rows.fill()
-        soft, closed, kept = self._rows.soft, self._rows.closed, self._rows.kept
-        nv = self.world.model.nv
-        J, e = soft.J[: soft.n], soft.lo[: soft.n]
-        H = J.T @ J
-        c = J.T @ e
-        weight = problem.posture_weight**2
-        H.reshape(-1)[:: nv + 1] += DAMPING + weight * self._joints
-        now = q[self._angles]
-        if weight > 0:
-            c[self._dofs] += weight * (now - problem.q_reference[self._angles])
-
-        lo, hi = np.empty(nv + kept.n), np.empty(nv + kept.n)
-        lo[:nv], hi[:nv] = -1e30, 1e30
-        lo[self._dofs] = np.minimum(self._q_min - now, 0.0)
-        hi[self._dofs] = np.maximum(self._q_max - now, 0.0)
-        lo[nv:], hi[nv:] = kept.lo[: kept.n], kept.hi[: kept.n]
-        return QP(
-            H=H,
-            c=c,
-            C=closed.J[: closed.n].copy(),
-            e=closed.lo[: closed.n].copy(),
-            A=kept.J[: kept.n].copy(),
-            lo=lo,
-            hi=hi,
-            sense=self._sense(kept.n),
-            merit=merit,
-        )
-
-    def _sense(self, rows: int) -> np.ndarray:
-        """(nv + m,) daqp's constraint types: bounds, then softened rows."""
-        if rows not in self._senses:
-            counts = (self.world.model.nv, rows)
-            self._senses[rows] = np.repeat(np.array([0, SOFT], np.int32), counts)
-        return self._senses[rows]
-
-    def step(self, qp: QP, radius: float = 1.0) -> np.ndarray:
-        """Solve; what cannot all be satisfied is shared out by least squares.
+        What cannot all be satisfied is shared out by least squares.
 
         Args:
-            qp: From `build`.
+            problem: What is wanted.
+            q: (nq,).
             radius: Share of the largest step that this one may take.
         """
-        nv = len(qp.c)
-        reach, step = radius * RECOVERY_STEP, radius * self._step
-        # What is violated is asked to recover only as far as such a step can reach:
-        # then every step, however short, points the right way.
-        lo, hi = np.minimum(qp.lo, reach), np.maximum(qp.hi, -reach)
-        np.maximum(lo[:nv], -step, out=lo[:nv])
-        np.minimum(hi[:nv], step, out=hi[:nv])
-        heavy = PENALTY * qp.C.T
-        e = np.minimum(np.maximum(qp.e, -reach), reach)
-        H, c = qp.H + heavy @ qp.C, qp.c - heavy @ e
-        x, _, flag, _ = daqp.solve(H, c, qp.A, hi, lo, qp.sense, rho_soft=1.0 / PENALTY)
-        if flag <= 0:
-            return np.zeros(nv)
-        return np.minimum(np.maximum(x, lo[:nv]), hi[:nv])
+        self.build(problem, q)
+        return self.core.step(radius)
 
     def solve(
         self,
@@ -370,52 +276,7 @@ class IK:
         that sets out pays for it at first. Where that has not paid off in the end, the
         solve begins again without.
         """
-        start = self.build(problem, q)
-        n, converged, x, merit = self._descend(
-            problem, q, start, iterations, tolerance, leap=True
-        )
-        if merit > start.merit:
-            more, converged, x, _ = self._descend(
-                problem, q, start, iterations, tolerance, leap=False
-            )
-            n += more
-        return Solution(
-            q=x, iterations=n, residuals=self.residuals(problem, x), converged=converged
-        )
-
-    def _descend(
-        self,
-        problem: PostureProblem,
-        q: np.ndarray,
-        qp: QP,
-        iterations: int,
-        tolerance: float,
-        *,
-        leap: bool,
-    ) -> tuple[int, bool, np.ndarray, float]:
-        """Iterations, whether they converged, and where they ended, with its merit."""
-        n, converged, radius, slow, merit = 0, False, 1.0, 0, qp.merit
-        for n in range(1, iterations + 1):
-            dq = self.step(qp, radius)
-            size = float(np.abs(dq).max())
-            trial = self.kin.integrate(q, dq)
-            # The next step will hardly be much longer than this one.
-            reach = min(NEAR_RANGE + size, ACTIVE_RANGE)
-            new = self._errors(problem, trial, reach)
-            if (leap and n == 1) or new <= merit:
-                gain = merit - new
-                slow = slow + 1 if gain < SLOW * new else 0
-                small = size < tolerance and size < 0.9 * radius * STEP_ROTATION
-                converged = small or slow >= 3
-                q, merit = trial, new
-                if not converged and n < iterations:
-                    qp = self._linearise(problem, q, merit)
-                radius = min(2.0 * radius, 1.0)
-            else:
-                radius *= 0.25
-            if converged or radius < MIN_RADIUS:
-                break
-        return n, converged, q, merit
+        return _solution(self.core.solve(self._ask(problem), q, iterations, tolerance))
 
     def solve_hard(
         self,
@@ -435,101 +296,63 @@ class IK:
             q: (nq,) to start from.
             hint: (nq,) a posture that solves a similar problem, tried first.
         """
-        best = self.solve(problem, q if hint is None else hint)
-        iterations = best.iterations
-        for start in (best.q, None) if hint is None else (q, best.q, None):
-            if best.status is Status.SOLVED:
-                break
-            if start is None:
-                nothing = np.full(len(problem.clearance), -np.inf)
-                free = self.solve(replace(problem, clearance=nothing), q)
-                iterations += free.iterations
-                start = free.q
-            trial = self.solve(problem, start)
-            iterations += trial.iterations
-            if trial.residuals.worst < best.residuals.worst:
-                best = trial
-        return replace(best, iterations=iterations)
+        return _solution(self.core.solve_hard(self._ask(problem), q, hint))
 
     def residuals(self, problem: PostureProblem, q: np.ndarray) -> Residuals:
         """Recompute everything from the model at `q`."""
-        kin, w, asked = self.kin, self.world, self._ask(problem)
-        kin.update(q)
-        contact = max(
-            (x.opened(kin) for x in problem.tasks if not isinstance(x, Reaching)),
-            default=0.0,
-        )
-        counts = asked.distance.counts
-        reach = float(problem.clearance.max(initial=0.02, where=counts))
-        near = kin.proximity(reach, counts)
-        short = problem.clearance.take(near.pairs) - near.distance
-        worst = int(np.argmax(short)) if len(short) else -1
-        distance = float(short[worst]) if len(short) else 0.0
-        points = asked.balance.points(kin)
-        margin = com_margin(kin.com[:2], support_polygon(points[:, :2]))
-        balance = max(problem.balance_margin - margin, 0.0)
-        over = np.maximum(w.q_min[w.dadr] - q[w.qadr], q[w.qadr] - w.q_max[w.dadr])
-        return Residuals(
-            contact=contact,
-            distance=max(distance, 0.0),
-            balance=balance if problem.balance else 0.0,
-            limits=max(float(over.max()), 0.0),
-            worst_pair=int(near.pairs[worst]) if distance > 0 else -1,
-            com_margin=margin,
-        )
+        return _residuals(self.core.residuals(self._ask(problem), q))
 
-    def _ask(self, problem: PostureProblem) -> _Asked:
-        """The tasks of a problem; those of the last one are kept."""
-        if self._asked is None or self._asked.problem is not problem:
-            self._asked = self._tasks_of(problem)
-        return self._asked
-
-    def _tasks_of(self, problem: PostureProblem) -> _Asked:
-        world, p = self.world, problem
-        tasks: list[Task] = [*p.tasks]
+    def _ask(self, p: PostureProblem) -> _core.Problem:
+        """A problem as the core has it; the last one is kept."""
+        if self._asked is not None and self._asked[0] is p:
+            return self._asked[1]
+        world, turns = self.world, p.base_rotation if p.base_weight > 0 else None
+        points = []
         if p.direction_weight > 0:
             weight = p.direction_weight
-            tasks += [pointing(world, n, u, weight) for n, u in p.directions.items()]
-        if p.base_rotation is not None and p.base_weight > 0:
-            tasks.append(Turned(rotation=p.base_rotation, weight=p.base_weight))
+            points = [pointing(world, n, u, weight) for n, u in p.directions.items()]
         if p.lean is not None:
-            tasks.append(leaning(world, *p.lean))
-        if p.com_target is not None and p.com_weight > 0:
-            tasks.append(Over(target=p.com_target, weight=p.com_weight))
-        balance = Balance(
-            contacts=[x for x in p.tasks if not isinstance(x, Reaching) and x.loaded],
-            margin=p.balance_margin,
-            middle_weight=p.com_weight if p.com_target is None else 0.0,
-            ellipse_weight=p.ellipse_weight,
+            points.append(leaning(world, *p.lean))
+        asked = _core.Problem(
+            self._model,
+            *packed_tasks(world, p.tasks),
+            *packed_pointing(points),
+            p.q_reference,
+            p.clearance,
+            None if turns is None else np.ascontiguousarray(turns).ravel(),
+            p.com_target,
+            p.balance,
+            np.array(
+                [
+                    p.balance_margin,
+                    p.posture_weight,
+                    p.base_weight,
+                    p.com_weight,
+                    p.ellipse_weight,
+                ]
+            ),
         )
-        if p.balance:
-            tasks.append(balance)
-        counts = np.isfinite(p.clearance)
-        if self._rough.any():
-            apart = counts & (self._rough > 0) & ~self._touching(p.tasks)
-            tasks.append(Apart(wanted=p.clearance + self._rough, counts=apart))
-        distance = Distance(clearance=p.clearance, counts=counts)
-        tasks.append(distance)
-        return _Asked(problem=p, tasks=tasks, balance=balance, distance=distance)
-
-    def _touching(self, tasks: Collection[SurfaceTask]) -> np.ndarray:
-        """(P,) bool: pairs of links in contact with their supports.
-
-        They are as near as their contact is: of those, only what was told keeps apart.
-        """
-        w = self.world
-        out, bodies = np.zeros(len(w.pairs), dtype=bool), w.model.geom_bodyid[w.pairs]
-        for x in tasks:
-            if not isinstance(x, Reaching):
-                of_link = bodies == w.surfaces[x.contact.surface].body
-                of_support = w.pairs == w.support_geom[x.contact.support]
-                out |= of_link.any(axis=1) & of_support.any(axis=1)
-        return out & ~self._told
+        self._asked = p, asked
+        return asked
 
 
-def _as_slice(indices: np.ndarray) -> slice | np.ndarray:
-    """The same indices as a slice where they are consecutive: indexing is cheaper."""
-    first = int(indices[0])
-    if np.array_equal(indices, np.arange(first, first + len(indices))):
-        return slice(first, first + len(indices))
-    return indices
+def _solution(found: tuple[np.ndarray, int, bool, tuple]) -> Solution:
+    q, iterations, converged, residuals = found
+    return Solution(
+        q=q,
+        iterations=iterations,
+        residuals=_residuals(residuals),
+        converged=converged,
+    )
+
+
+def _residuals(found: tuple) -> Residuals:
+    contact, distance, balance, limits, worst_pair, com_margin = found
+    return Residuals(
+        contact=contact,
+        distance=distance,
+        balance=balance,
+        limits=limits,
+        worst_pair=worst_pair,
+        com_margin=com_margin,
+    )

@@ -17,6 +17,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
@@ -34,7 +35,7 @@ from clamber.step.statics import StaticEquilibrium
 from clamber.step.tasks import SurfaceTask, closed, sliding, support_rotation
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
-CLEARANCE = 0.010  # [m] p_safe: between links, and between links and the scene
+CLEARANCE: float = _core.CLEARANCE  # [m] p_safe: of links from links and the scene
 HOLD_WEIGHT = 40.0  # of a new contact at a position that an outer method prescribes
 
 

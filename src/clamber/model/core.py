@@ -1,0 +1,122 @@
+"""A world's constants as the native core takes them: arrays, once for each world."""
+
+from __future__ import annotations
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import mujoco
+import numpy as np
+
+from clamber import _core
+from clamber.model.world import World
+
+# The kinds of shapes in the core's order; whatever is no plain shape is a hull.
+_GEOM = mujoco.mjtGeom
+_SHAPES = (
+    _GEOM.mjGEOM_PLANE,
+    _GEOM.mjGEOM_SPHERE,
+    _GEOM.mjGEOM_CAPSULE,
+    _GEOM.mjGEOM_ELLIPSOID,
+    _GEOM.mjGEOM_CYLINDER,
+    _GEOM.mjGEOM_BOX,
+)
+_CONVEX = len(_SHAPES)
+_MODELS: WeakKeyDictionary[World, _core.Model] = WeakKeyDictionary()
+
+
+def core_of(world: World) -> _core.Model:
+    """The world's constants in the native core, handed over once."""
+    if world not in _MODELS:
+        _MODELS[world] = _core.Model(_constants(world))
+    return _MODELS[world]
+
+
+def _constants(world: World) -> dict[str, Any]:
+    m, supports = world.model, list(world.supports)
+    kinds, vertices = shapes_of(m)
+    landmarks = {s: world.landmark(world.robot.limb_of(s).root) for s in world.surfaces}
+    return {
+        "nq": m.nq,
+        "nv": m.nv,
+        "base": world.base,
+        "mass": world.mass,
+        "body_parent": _whole(m.body_parentid),
+        "body_pos": _real(m.body_pos),
+        "body_quat": _real(m.body_quat),
+        "body_mass": _real(m.body_mass),
+        "body_ipos": _real(m.body_ipos),
+        "body_joint": _whole(m.body_jntadr),
+        "body_joints": _whole(m.body_jntnum),
+        "joint_kind": _whole(m.jnt_type),
+        "joint_body": _whole(m.jnt_bodyid),
+        "joint_qadr": _whole(m.jnt_qposadr),
+        "joint_dadr": _whole(m.jnt_dofadr),
+        "joint_axis": _real(m.jnt_axis),
+        "joint_pos": _real(m.jnt_pos),
+        "joint_zero": _real(m.qpos0[m.jnt_qposadr]),
+        "geom_shape": kinds,
+        "geom_body": _whole(m.geom_bodyid),
+        "geom_pos": _real(m.geom_pos),
+        "geom_quat": _real(m.geom_quat),
+        "geom_size": _real(m.geom_size),
+        "geom_vertices": vertices,
+        "pairs": _whole(world.pairs),
+        "supports": [
+            {
+                "position": _real(s.position),
+                "rotation": _real(s.rotation),
+                "friction": s.friction,
+                "geom": world.support_geom[name],
+                "A": _real(s.edges()[0]),
+                "b": _real(s.edges()[1]),
+            }
+            for name, s in world.supports.items()
+        ],
+        "surfaces": [
+            {
+                "body": s.body,
+                "radius": s.radius,
+                "flat": s.is_flat,
+                "rotation": _real(np.eye(3) if s.rotation is None else s.rotation),
+                "centre": _real(s.centre),
+                "corners": _real(s.corners),
+                "mass_body": landmarks[name][0],
+                "mass_point": _real(landmarks[name][1]),
+                "touching": [
+                    {"planned": _whole(planned), "further": _whole(further)}
+                    for planned, further in (
+                        world.touching[name, support] for support in supports
+                    )
+                ],
+            }
+            for name, s in world.surfaces.items()
+        ],
+        "qadr": _whole(world.qadr),
+        "dadr": _whole(world.dadr),
+        "q_min": _real(world.q_min[world.dadr]),
+        "q_max": _real(world.q_max[world.dadr]),
+        "tau_max": _real(world.tau_max),
+    }
+
+
+def shapes_of(model: mujoco.MjModel) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Kinds (ngeom,) of all geoms for the core, and the vertices (k, 3) of hulls."""
+    kinds, vertices = [], []
+    for g in range(model.ngeom):
+        kind, points = mujoco.mjtGeom(int(model.geom_type[g])), np.zeros((0, 3))
+        if kind == _GEOM.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[g])
+            first, n = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+            points = _real(model.mesh_vert[first : first + n])
+        kinds.append(_SHAPES.index(kind) if kind in _SHAPES else _CONVEX)
+        vertices.append(points)
+    return np.array(kinds, np.int32), vertices
+
+
+def _real(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x, dtype=float)
+
+
+def _whole(x: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(x, dtype=np.int32)

@@ -1,0 +1,113 @@
+#include "holding.h"
+
+namespace clamber {
+
+namespace {
+
+constexpr double EFFORT_SHARE = 0.9;  // of the effort limits: servos need the rest
+constexpr double SPARED_ARM = 0.004;  // [m] times the weight: torque not counted on
+constexpr double LEAST_SHARE = 0.25;  // of the effort limits that is, all the same
+
+}  // namespace
+
+Holding::Holding(const Model& model)
+    : model_(model), gravity_(model.nv), limits_(model.dadr.size()) {}
+
+void Holding::look(Kinematics& kin, const std::vector<Contact>& contacts) {
+    points_.clear();
+    normals_.clear();
+    mu_.clear();
+    owner_.clear();
+    com_ = kin.com();
+    const int nv = model_.nv, na = static_cast<int>(model_.dadr.size());
+    std::size_t rows = 0;
+    for (const Contact& c : contacts) rows += 3 * kin.touching(c.surface, c.edge).corners;
+    jacobian_.assign(rows * nv, 0.0);
+    double* row = jacobian_.data();
+    std::vector<bool> bears(nv, false);
+    for (std::size_t i = 0; i < contacts.size(); ++i) {
+        const Contact& c = contacts[i];
+        const Surface& s = model_.surfaces[c.surface];
+        const Support& on = model_.supports[c.support];
+        const Touching& touching = kin.touching(c.surface, c.edge);
+        for (int k = 0; k < touching.corners; ++k, row += 3 * nv) {
+            const Vec3 p = kin.point(s.body, touching.corner[k]) - on.normal * s.radius;
+            points_.push_back({p.x, p.y, p.z});
+            normals_.push_back({on.normal.x, on.normal.y, on.normal.z});
+            mu_.push_back(on.friction);
+            owner_.push_back(static_cast<int>(i));
+            for (const int d : model_.chain[s.body]) {
+                const Vec3 moves = kin.twist(d).v + cross(kin.twist(d).w, p);
+                for (int axis = 0; axis < 3; ++axis) row[axis * nv + d] = moves[axis];
+                bears[d] = bears[d] || square(moves) > 0.0;
+            }
+        }
+    }
+    const double weight = model_.mass * GRAVITY;
+    const Vec3* jcom = kin.com_jacobian();
+    for (int d = 0; d < nv; ++d) gravity_[d] = weight * jcom[d].z;
+    for (int j = 0; j < na; ++j) {
+        const double most = model_.tau_max[j];
+        const double spared = bears[model_.dadr[j]] ? SPARED_ARM * weight : 0.0;
+        limits_[j] = std::max(EFFORT_SHARE * most - spared, LEAST_SHARE * most);
+    }
+}
+
+ContactPointsView Holding::points() const {
+    ContactPointsView out;
+    out.n = static_cast<int>(points_.size());
+    out.points = reinterpret_cast<const double (*)[3]>(points_.data());
+    out.normals = reinterpret_cast<const double (*)[3]>(normals_.data());
+    out.mu = mu_.data();
+    return out;
+}
+
+LoadView Holding::load() const {
+    LoadView out;
+    write3(com_, out.com);
+    out.mass = model_.mass;
+    return out;
+}
+
+TorqueView Holding::torque() const {
+    TorqueView out;
+    out.jacobian = jacobian_.data();
+    out.gravity = gravity_.data();
+    out.dofs = model_.dadr.data();
+    out.limits = limits_.data();
+    out.na = static_cast<int>(limits_.size());
+    out.nv = model_.nv;
+    return out;
+}
+
+double Holding::residual() { return statics_.residual(points(), load(), torque()); }
+
+bool Holding::torques_with(const TorqueView& torque, const double* price, double* tau) {
+    forces_.assign(points_.size(), {});
+    statics_.contact_forces(points(), load(), torque, price,
+                            reinterpret_cast<double (*)[3]>(forces_.data()));
+    bool within = true;
+    for (std::size_t j = 0; j < limits_.size(); ++j) {
+        const int d = model_.dadr[j];
+        tau[j] = gravity_[d];
+        for (std::size_t i = 0; i < forces_.size(); ++i)
+            for (int axis = 0; axis < 3; ++axis)
+                tau[j] -= jacobian_[(3 * i + axis) * model_.nv + d] * forces_[i][axis];
+        within = within && std::abs(tau[j]) <= limits_[j];
+    }
+    return within;
+}
+
+void Holding::torques(const double* price, double* tau) {
+    const double* each = nullptr;
+    if (price) {
+        price_.clear();
+        for (const int i : owner_) price_.push_back(price[i]);
+        each = price_.data();
+    }
+    if (!torques_with(TorqueView{}, each, tau)) torques_with(torque(), each, tau);
+    for (std::size_t j = 0; j < limits_.size(); ++j)
+        tau[j] = std::min(std::max(tau[j], -model_.tau_max[j]), model_.tau_max[j]);
+}
+
+}  // namespace clamber

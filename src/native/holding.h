@@ -1,0 +1,48 @@
+// What contacts ask of the joints at a posture: points that bear, what they load, and the
+// torques that go with the least forces.
+#pragma once
+
+#include <vector>
+
+#include "model.h"
+#include "statics.h"
+
+namespace clamber {
+
+// As in `clamber.contact.contact`.
+struct Contact {
+    int surface = 0, support = 0, edge = -1;
+    bool has_link = false;
+    Vec3 position;
+    Quat quaternion, link;
+};
+
+class Holding {
+  public:
+    explicit Holding(const Model& model);
+
+    // Look at contacts at the present posture.
+    void look(Kinematics& kin, const std::vector<Contact>& contacts);
+    // Wrench and torques left over by the least forces, in weights: within
+    // `BALANCE_TOL` where friction cones and torques that are counted on hold the robot.
+    double residual();
+    // (na) torques that balance gravity with the least contact forces; where these ask
+    // more of a joint than is counted on, with those that do not. `price` of a force at
+    // each contact, or none.
+    void torques(const double* price, double* tau);
+
+  private:
+    bool torques_with(const TorqueView& torque, const double* price, double* tau);
+    ContactPointsView points() const;
+    LoadView load() const;
+    TorqueView torque() const;
+
+    const Model& model_;
+    Statics statics_;
+    Vec3 com_;
+    std::vector<std::array<double, 3>> points_, normals_, forces_;
+    std::vector<double> mu_, jacobian_, gravity_, limits_, price_;
+    std::vector<int> owner_;  // contact of each point
+};
+
+}  // namespace clamber

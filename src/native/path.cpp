@@ -1,0 +1,367 @@
+#include "path.h"
+
+namespace clamber {
+
+namespace {
+
+constexpr double SAFE_HEIGHT = 0.05;  // [m] h_safe of (4.29)
+constexpr double TOP_RISE = 0.05;     // [m] both ends on top: the apex is so much higher
+constexpr int ARC_POINTS = 12;        // control points of an arc, its ends included
+constexpr int BRIDGE_POINTS = 3;      // at most, where nothing moves far
+constexpr double BRIDGE_STEP = 0.1;   // [rad, m] of the way from one to the next
+constexpr double LOOSE_ARC_WEIGHT = 1.0;  // ... where a gap is halved, against posture 1
+constexpr int NODE_ITERATIONS = 25;
+constexpr double NODE_STEP = 0.01;     // [rad] a shorter last step leaves nothing to mend
+constexpr double BRIDGE_MARGIN = 0.01;  // [m] of the centre of mass on the way
+constexpr double DRIFT_TOL = 0.002;     // [m] contacts that drift by more refine a gap
+constexpr double OVERLAP_TOL = 0.001;   // [m] links that enter others by more refine it
+constexpr int MAX_REFINEMENTS = 4;       // halvings between two postures
+constexpr double ENDS = 5.0;  // a swing's first and last fifth: supports may be touched
+constexpr double COM_WEIGHT = 0.3, ELLIPSE_WEIGHT = 2.0;
+
+// Height of a support's highest point below the way from p1 to p2.
+double highest(const Support& s, const Vec3& p1, const Vec3& p2) {
+    if (s.normal.z >= 1.0) return s.position.z;
+    constexpr int n = 4 * ARC_POINTS;
+    double out = -FAR;
+    for (int i = 0; i < n; ++i) {
+        Vec3 p = p1 + (p2 - p1) * (static_cast<double>(i) / (n - 1));
+        p.z -= s.height(p) / s.normal.z;
+        bool in = true;
+        for (std::size_t k = 0; k < s.A.size(); ++k) in = in && dot(s.A[k], p) <= s.b[k];
+        if (in) out = std::max(out, p.z);
+    }
+    return out > -FAR ? out : s.position.z;
+}
+
+}  // namespace
+
+SurfaceTask closed_task(const Model& model, const Contact& c) {
+    SurfaceTask t;
+    t.kind = c.edge < 0 ? TaskKind::Closed : TaskKind::OnEdge;
+    t.surface = c.surface;
+    t.support = c.support;
+    t.edge = c.edge;
+    t.has_link = c.has_link;
+    t.position = c.position;
+    t.link = c.link;
+    t.rotation = quat_from_matrix(frame_from_normal(model.supports[c.support].normal,
+                                                    matrix(c.quaternion).col(0)));
+    return t;
+}
+
+void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
+         std::vector<Vec3>& out) {
+    double apex =
+        std::max(0.5 * (p1.z + p2.z) + 0.5 * norm(p1 - p2), top + SAFE_HEIGHT);
+    if (on_top) apex = std::min(apex, std::max(p1.z, p2.z) + TOP_RISE + SAFE_HEIGHT);
+    // Parabola with the given maximum: z = z1 (1-s) + z2 s + 4 c s (1-s).
+    const double a = apex - p1.z, b = apex - p2.z;
+    double c = 0.0;
+    if (a > 0.0 && b > 0.0) {
+        const double root = std::sqrt(a) + std::sqrt(b);
+        c = 0.25 * root * root;
+    }
+    const int n = std::max(points, 5);
+    out.resize(n);
+    for (int i = 0; i < n; ++i) {
+        const double s = static_cast<double>(i) / (n - 1);
+        out[i] = p1 + (p2 - p1) * s;
+        out[i].z += 4.0 * c * s * (1.0 - s);
+    }
+}
+
+PathPlanner::PathPlanner(const Model& model)
+    : solver(model), model_(model), holding_(model), tangent_(model.nv), reference_(model.nq) {}
+
+void PathPlanner::ask_balance(const std::vector<Contact>& contacts, double margin,
+                              double posture_weight) {
+    Problem& p = problem_;
+    p = Problem{};
+    p.balance_margin = margin;
+    p.posture_weight = posture_weight;
+    p.ellipse_weight = ELLIPSE_WEIGHT;
+    p.com_weight = COM_WEIGHT;
+    p.clearance.assign(model_.pairs.size(), CLEARANCE);
+    for (const Contact& c : contacts) {
+        p.tasks.push_back(closed_task(model_, c));
+        const auto& [planned, further] = model_.touching[c.surface][c.support];
+        const double nothing = -std::numeric_limits<double>::infinity();
+        for (const int i : further) p.clearance[i] = FURTHER_CLEARANCE;
+        for (const int i : planned) p.clearance[i] = c.edge >= 0 ? 0.0 : nothing;
+    }
+}
+
+void PathPlanner::between(const std::vector<double>& a, const std::vector<double>& b,
+                          double share, std::vector<double>& out) {
+    difference(model_, a.data(), b.data(), tangent_.data());
+    for (double& d : tangent_) d *= share;
+    out.resize(model_.nq);
+    integrate(model_, a.data(), tangent_.data(), out.data());
+}
+
+void PathPlanner::solve_node(const std::vector<double>& from,
+                             const std::vector<double>& other, std::vector<double>& q) {
+    solver.solve(problem_, from.data(), NODE_ITERATIONS, NODE_STEP, first_);
+    if (!first_.residuals.solved()) {
+        solver.solve(problem_, other.data(), 60, 2e-3, second_);
+        if (second_.residuals.worst() < first_.residuals.worst()) std::swap(first_, second_);
+    }
+    q = first_.q;
+}
+
+void PathPlanner::bridge_node(const std::vector<double>& near,
+                              const std::vector<double>& other, std::vector<double>& q) {
+    problem_.q_reference = near;
+    solve_node(near, other, q);
+}
+
+void PathPlanner::bridge(const std::vector<double>& a, const std::vector<double>& b,
+                         const std::vector<Contact>& contacts, Postures& out) {
+    ask_balance(contacts, BRIDGE_MARGIN, 1.0);
+    problem_.ellipse_weight = problem_.com_weight = 0.0;
+    difference(model_, a.data(), b.data(), tangent_.data());
+    double way = 0.0;
+    for (const double d : tangent_) way = std::max(way, std::abs(d));
+    const int points = way < BRIDGE_STEP * BRIDGE_POINTS ? static_cast<int>(way / BRIDGE_STEP)
+                                                         : BRIDGE_POINTS;
+    std::vector<double> middle;
+    const auto node = [&](double share, const std::vector<double>& last, bool halves,
+                          std::vector<double>& q) {
+        if (halves) {
+            bridge_node(last, last, q);
+        } else {
+            between(a, b, share, middle);
+            bridge_node(middle, last, q);
+        }
+    };
+    fill(a, b, points + 2, contacts, {}, true, node, out);
+}
+
+// Let clearances grow from, and shrink to, what the end postures have: at lift-off and
+// touch-down the limb is as near to the supports as they are, and asking for the full
+// distance at once would tear it off them sideways.
+void PathPlanner::near_ends(const Transition& t) {
+    std::vector<unsigned char> counts(model_.pairs.size());
+    for (std::size_t i = 0; i < counts.size(); ++i) counts[i] = std::isfinite(clearance_[i]);
+    for (int k = 0; k < 2; ++k) {
+        ends_[k].clear();
+        solver.kin.update(k == 0 ? t.shifted.data() : t.touching.data());
+        for (const auto& [pair, at] :
+             solver.near.query(solver.kin.geom_poses(), CLEARANCE, counts.data()))
+            ends_[k].push_back({pair, std::min(std::max(at.distance, 0.0), CLEARANCE)});
+    }
+}
+
+void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& control,
+                             double share, const std::vector<double>& last, bool halves,
+                             std::vector<double>& q) {
+    const int n = static_cast<int>(control.size());
+    const double x = share * (n - 1);
+    const int i = std::min(static_cast<int>(x), n - 2);
+    SurfaceTask& reach = problem_.tasks.back();
+    reach.position = control[i] + (control[i + 1] - control[i]) * (x - i);
+    reach.weight = halves ? LOOSE_ARC_WEIGHT : ARC_WEIGHT;
+    problem_.posture_weight = halves ? 1.0 : 0.3;
+    if (halves)
+        reference_ = last;
+    else
+        between(t.shifted, t.touching, share, reference_);
+    problem_.q_reference = reference_;
+    if (!t.adapt) {
+        std::fill(problem_.clearance.begin(), problem_.clearance.end(),
+                  -std::numeric_limits<double>::infinity());
+        solver.solve(problem_, last.data(), NODE_ITERATIONS, 2e-3, first_);
+        q = first_.q;
+        return;
+    }
+    problem_.clearance = clearance_;
+    const double ramp = std::min(1.0, std::min(ENDS * share, ENDS * (1.0 - share)));
+    if (ramp < 1.0)
+        for (const Eased& e : ends_[share < 0.5 ? 0 : 1]) {
+            const double eased = e.distance * (1.0 - ramp) + ramp * CLEARANCE;
+            problem_.clearance[e.pair] = std::min(problem_.clearance[e.pair], eased);
+        }
+    solve_node(last, reference_, q);
+}
+
+void PathPlanner::swing(const Transition& t, Path& out) {
+    out.control.clear();
+    if (!t.makes) {
+        bridge(t.shifted, t.touching, t.held, out.phases[1]);
+        return;
+    }
+    const Support& support = model_.supports[t.made.support];
+    solver.kin.update(t.shifted.data());
+    const Vec3 p1 = solver.kin.contact_point(t.made.surface, -1, support.normal);
+    bool slides = false;
+    for (const Contact& c : t.rolling)
+        slides = slides || (c.surface == t.made.surface && c.support == t.made.support);
+    arc(p1, t.made.position, highest(support, p1, t.made.position), slides, ARC_POINTS,
+        out.control);
+    ask_balance(t.held, t.margin, 0.3);
+    SurfaceTask reach = closed_task(model_, t.made);
+    reach.kind = TaskKind::Reaching;
+    reach.edge = -1;
+    problem_.tasks.push_back(reach);
+    clearance_ = problem_.clearance;
+    near_ends(t);
+    std::vector<Contact> moving = t.rolling;
+    moving.push_back(t.made);
+    const auto node = [&](double share, const std::vector<double>& last, bool halves,
+                          std::vector<double>& q) {
+        swing_node(t, out.control, share, last, halves, q);
+    };
+    fill(t.shifted, t.touching, static_cast<int>(out.control.size()), t.held, moving,
+         t.adapt, node, out.phases[1]);
+}
+
+// Postures from a to b, closer together where it matters: a gap is halved while, in its
+// middle, a contact has drifted or links overlap. The posture put there is the nearest to
+// the middle that satisfies the constraints: where the limb must pause while the trunk
+// rises, the way leaves the arc.
+template <typename Fill>
+void PathPlanner::fill(const std::vector<double>& a, const std::vector<double>& b,
+                       int points, const std::vector<Contact>& contacts,
+                       const std::vector<Contact>& moving, bool refine, Fill node,
+                       Postures& out) {
+    watch(contacts, {}, aloft_);
+    watch(contacts, moving, low_);
+    std::vector<Node> nodes{{0.0, a}}, finer;
+    for (int i = 1; i < points - 1; ++i) {
+        Node next{static_cast<double>(i) / (points - 1), {}};
+        node(next.share, nodes.back().q, false, next.q);
+        nodes.push_back(std::move(next));
+    }
+    nodes.push_back({1.0, b});
+    std::vector<double> middle;
+    for (int round = 0; refine && round < MAX_REFINEMENTS; ++round) {
+        finer.assign(1, nodes[0]);
+        for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
+            between(nodes[i].q, nodes[i + 1].q, 0.5, middle);
+            const double share = 0.5 * (nodes[i].share + nodes[i + 1].share);
+            const bool inner = ENDS * std::min(share, 1.0 - share) >= 1.0;
+            const double depth = overlap(middle.data(), inner ? aloft_ : low_, nullptr);
+            if (drift(nullptr, contacts) > DRIFT_TOL || depth > OVERLAP_TOL) {
+                Node next{share, {}};
+                node(share, middle, true, next.q);
+                finer.push_back(std::move(next));
+            }
+            finer.push_back(nodes[i + 1]);
+        }
+        if (finer.size() == nodes.size()) break;
+        nodes.swap(finer);
+    }
+    out.clear();
+    for (Node& n : nodes) out.push_back(std::move(n.q));
+}
+
+void PathPlanner::watch(const std::vector<Contact>& contacts,
+                        const std::vector<Contact>& more,
+                        std::vector<unsigned char>& out) const {
+    out.assign(model_.pairs.size(), 1);
+    for (const auto* list : {&contacts, &more})
+        for (const Contact& c : *list)
+            for (const auto& pairs : model_.touching[c.surface][c.support])
+                for (const int i : pairs) out[i] = 0;
+}
+
+// Deepest overlap at q among the watched pairs; leaves the kinematics at q.
+double PathPlanner::overlap(const double* q, const std::vector<unsigned char>& watched,
+                            int* pair) {
+    solver.kin.update(q);
+    double deepest = 0.0;
+    for (const auto& [i, at] :
+         solver.near.query(solver.kin.geom_poses(), 0.0, watched.data()))
+        if (-at.distance > deepest) {
+            deepest = -at.distance;
+            if (pair) *pair = i;
+        }
+    return deepest;
+}
+
+// Largest distance of a contact from its place; at the present posture without q.
+double PathPlanner::drift(const double* q, const std::vector<Contact>& contacts) {
+    if (q) solver.kin.update(q);
+    double out = 0.0;
+    for (const Contact& c : contacts) {
+        const Vec3& n = model_.supports[c.support].normal;
+        Vec3 gap = solver.kin.contact_point(c.surface, c.edge, n) - c.position;
+        if (c.has_link && model_.surfaces[c.surface].radius > 0.0)
+            gap -= solver.kin.roll(c.surface, n, c.link);
+        out = std::max(out, norm(gap));
+    }
+    return out;
+}
+
+bool PathPlanner::is_stable(const std::vector<Contact>& contacts, const double* q) {
+    solver.kin.update(q);
+    holding_.look(solver.kin, contacts);
+    return holding_.residual() <= BALANCE_TOL;
+}
+
+void PathPlanner::holding_torques(const std::vector<Contact>& contacts,
+                                  const double* price, const double* q, double* tau) {
+    solver.kin.update(q);
+    holding_.look(solver.kin, contacts);
+    holding_.torques(price, tau);
+}
+
+// Overlaps and contacts at all postures and half-way between, solver aside. Whether the
+// contacts hold the robot at the postures of a swing, too: those at its ends have been
+// looked at, and while weight shifts more contacts bear.
+void PathPlanner::check(const Transition& t, Path& out) {
+    std::vector<Contact> both = t.held, after = t.held, moving = t.rolling;
+    both.insert(both.end(), t.rolling.begin(), t.rolling.end());
+    if (t.makes) {
+        after.push_back(t.made);
+        moving.push_back(t.made);
+    }
+    const std::vector<Contact>* contacts[3] = {&both, &t.held, &after};
+    out.status = Path::Status::Solved;
+    out.depth = 0.0;
+    out.pair = -1;
+    out.weak.clear();
+    std::vector<double> middle;
+    for (int k = 0; k < 3; ++k) {
+        const Postures& nodes = out.phases[k];
+        watch(*contacts[k], moving, low_);
+        for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
+            between(nodes[i], nodes[i + 1], 0.5, middle);
+            for (const double* q : {const_cast<const double*>(middle.data()), nodes[i + 1].data()}) {
+                int pair = -1;
+                const double depth = overlap(q, low_, &pair);
+                if (depth > out.depth) {
+                    out.depth = depth;
+                    out.pair = pair;
+                    out.phase = k;
+                }
+                const double open = drift(nullptr, *contacts[k]);
+                if (open > DRIFT_LIMIT) {
+                    out.status = Path::Status::Opens;
+                    out.depth = open;
+                    out.phase = k;
+                    return;
+                }
+            }
+            if (k == 1 && out.weak.empty() && !is_stable(t.held, nodes[i + 1].data()))
+                out.weak = nodes[i + 1];
+        }
+    }
+    if (out.depth > OVERLAP_LIMIT)
+        out.status = Path::Status::Overlaps;
+    else if (!out.weak.empty())
+        out.status = Path::Status::Weak;
+}
+
+void PathPlanner::plan(const Transition& t, Path& out) {
+    swing(t, out);
+    std::vector<Contact> both = t.held, after = t.held;
+    both.insert(both.end(), t.rolling.begin(), t.rolling.end());
+    if (t.makes) after.push_back(t.made);
+    bridge(t.before, t.shifted, both, out.phases[0]);
+    bridge(t.touching, t.after, after, out.phases[2]);
+    check(t, out);
+}
+
+}  // namespace clamber

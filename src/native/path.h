@@ -1,0 +1,105 @@
+// The postures of one contact change: weight shift, new contact, and the way between.
+#pragma once
+
+#include <vector>
+
+#include "holding.h"
+#include "ik.h"
+
+namespace clamber {
+
+constexpr double CLEARANCE = 0.010;  // [m] p_safe: between links, and links and the scene
+constexpr double FURTHER_CLEARANCE = 0.004;  // [m] a shin beside its knee
+constexpr double ARC_WEIGHT = 40.0;      // of the arc, against posture 0.3 and constraints
+constexpr double DRIFT_LIMIT = 0.01;     // [m] of contacts, anywhere on the path
+constexpr double OVERLAP_LIMIT = 0.004;  // [m] of links, anywhere on the path
+
+using Postures = std::vector<std::vector<double>>;  // each (nq)
+
+// What moves one contact: its postures are known, the way between them is not.
+struct Transition {
+    std::vector<double> before, shifted, touching, after;
+    std::vector<Contact> held, rolling;  // that stay; that are broken, as they are let go
+    bool makes = false;
+    Contact made;
+    double margin = 0.0;  // of the centre of mass to the border of its polygon [m]
+    bool adapt = true;    // push control points away from collisions (4.30)
+};
+
+struct Path {
+    enum class Status : int { Solved = 0, Opens = 1, Overlaps = 2, Weak = 3 };
+
+    std::array<Postures, 3> phases;  // shift, swing, settle
+    std::vector<Vec3> control;       // of the arc (4.29)
+    Status status = Status::Solved;
+    int phase = 0;            // in which it fails
+    double depth = 0.0;       // of the deepest overlap [m], or how far a contact opens
+    int pair = -1;            // that overlaps
+    std::vector<double> weak;  // (nq) the first posture of a swing that cannot be held
+};
+
+class PathPlanner {
+  public:
+    explicit PathPlanner(const Model& model);
+
+    void plan(const Transition& t, Path& out);
+    // What is wrong with the phases of a path.
+    void check(const Transition& t, Path& out);
+    // Postures from a to b with all contacts closed, near the straight way.
+    void bridge(const std::vector<double>& a, const std::vector<double>& b,
+                const std::vector<Contact>& contacts, Postures& out);
+    // Whether contact forces and torques that are counted on hold the robot at `q`.
+    bool is_stable(const std::vector<Contact>& contacts, const double* q);
+    // (na) torques that hold it there, a force at each contact at its price.
+    void holding_torques(const std::vector<Contact>& contacts, const double* price,
+                         const double* q, double* tau);
+
+    Solver solver;
+
+  private:
+    struct Node {
+        double share;
+        std::vector<double> q;
+    };
+    // Balance on contacts, near a posture.
+    void ask_balance(const std::vector<Contact>& contacts, double margin,
+                     double posture_weight);
+    void swing(const Transition& t, Path& out);
+    void swing_node(const Transition& t, const std::vector<Vec3>& control, double share,
+                    const std::vector<double>& last, bool between, std::vector<double>& q);
+    void bridge_node(const std::vector<double>& near, const std::vector<double>& other,
+                     std::vector<double>& q);
+    void solve_node(const std::vector<double>& from, const std::vector<double>& other,
+                    std::vector<double>& q);
+    template <typename Fill>
+    void fill(const std::vector<double>& a, const std::vector<double>& b, int points,
+              const std::vector<Contact>& contacts, const std::vector<Contact>& moving,
+              bool refine, Fill node, Postures& out);
+    void watch(const std::vector<Contact>& contacts, const std::vector<Contact>& more,
+               std::vector<unsigned char>& out) const;
+    double overlap(const double* q, const std::vector<unsigned char>& watched, int* pair);
+    double drift(const double* q, const std::vector<Contact>& contacts);
+    void between(const std::vector<double>& a, const std::vector<double>& b, double share,
+                 std::vector<double>& out);
+    void near_ends(const Transition& t);
+
+    const Model& model_;
+    Holding holding_;
+    Problem problem_;
+    Solution first_, second_;
+    std::vector<double> tangent_, reference_, clearance_;
+    std::vector<unsigned char> aloft_, low_;
+    struct Eased {
+        int pair;
+        double distance;
+    };
+    std::array<std::vector<Eased>, 2> ends_;  // near the supports, at lift-off, touch-down
+};
+
+// A task that closes a contact in its place.
+SurfaceTask closed_task(const Model& model, const Contact& c);
+// Control points of the arc from p1 to p2 (4.29).
+void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
+         std::vector<Vec3>& out);
+
+}  // namespace clamber

@@ -1,0 +1,537 @@
+// Model, Solver and paths for Python: arrays in, arrays out.
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <mutex>
+#include <stdexcept>
+
+#include "bindings.h"
+#include "path.h"
+
+namespace clamber {
+
+namespace {
+
+using Matrix = nb::ndarray<nb::numpy, double, nb::c_contig, nb::device::cpu>;
+
+Matrix own(std::vector<double>&& data, std::vector<std::size_t> shape) {
+    auto* kept = new std::vector<double>(std::move(data));
+    nb::capsule owner(kept, [](void* p) noexcept {
+        delete static_cast<std::vector<double>*>(p);
+    });
+    return Matrix(kept->data(), shape.size(), shape.data(), owner);
+}
+
+Matrix own(std::vector<double>&& data) {
+    const std::size_t n = data.size();
+    return own(std::move(data), {n});
+}
+
+Matrix stacked(const Postures& q, std::size_t nq) {
+    std::vector<double> out;
+    out.reserve(q.size() * nq);
+    for (const auto& x : q) out.insert(out.end(), x.begin(), x.end());
+    return own(std::move(out), {q.size(), nq});
+}
+
+template <typename T>
+nb::ndarray<const T, nb::c_contig, nb::device::cpu> column(const nb::dict& d,
+                                                           const char* name) {
+    return nb::cast<nb::ndarray<const T, nb::c_contig, nb::device::cpu>>(d[name]);
+}
+
+template <typename T>
+std::vector<T> list(const nb::dict& d, const char* name) {
+    const auto a = column<T>(d, name);
+    return {a.data(), a.data() + a.size()};
+}
+
+Touching touching_from(const double* corners, int n) {
+    Touching out;
+    out.corners = n;
+    for (int k = 0; k < n; ++k) {
+        out.corner[k] = read3(corners + 3 * k);
+        out.centre += out.corner[k] * (1.0 / n);
+    }
+    return out;
+}
+
+// Built from what `clamber.model.core` hands over.
+Model read_model(const nb::dict& d) {
+    Model m;
+    m.nq = nb::cast<int>(d["nq"]);
+    m.nv = nb::cast<int>(d["nv"]);
+    m.base = nb::cast<int>(d["base"]);
+    m.mass = nb::cast<double>(d["mass"]);
+    const auto parent = column<int>(d, "body_parent");
+    const auto body_pos = column<double>(d, "body_pos"), body_quat = column<double>(d, "body_quat");
+    const auto mass = column<double>(d, "body_mass"), ipos = column<double>(d, "body_ipos");
+    const auto first = column<int>(d, "body_joint"), count = column<int>(d, "body_joints");
+    for (std::size_t b = 0; b < parent.size(); ++b)
+        m.bodies.push_back({parent.data()[b], read3(body_pos.data() + 3 * b),
+                            readq(body_quat.data() + 4 * b), mass.data()[b],
+                            read3(ipos.data() + 3 * b), first.data()[b], count.data()[b]});
+    const auto kind = column<int>(d, "joint_kind"), joint_body = column<int>(d, "joint_body");
+    const auto qadr = column<int>(d, "joint_qadr"), dadr = column<int>(d, "joint_dadr");
+    const auto axis = column<double>(d, "joint_axis"), anchor = column<double>(d, "joint_pos");
+    const auto zero = column<double>(d, "joint_zero");
+    for (std::size_t j = 0; j < kind.size(); ++j)
+        m.joints.push_back({static_cast<JointKind>(kind.data()[j]), joint_body.data()[j],
+                            qadr.data()[j], dadr.data()[j], read3(axis.data() + 3 * j),
+                            read3(anchor.data() + 3 * j), zero.data()[j]});
+    const auto shape = column<int>(d, "geom_shape"), geom_body = column<int>(d, "geom_body");
+    const auto geom_pos = column<double>(d, "geom_pos"), geom_quat = column<double>(d, "geom_quat");
+    const auto size = column<double>(d, "geom_size");
+    const auto vertices = nb::cast<nb::list>(d["geom_vertices"]);
+    for (std::size_t g = 0; g < shape.size(); ++g) {
+        std::vector<Vec3> hull;
+        const auto points = nb::cast<Array2<>>(vertices[g]);
+        for (std::size_t k = 0; k < points.shape(0); ++k)
+            hull.push_back(read3(points.data() + 3 * k));
+        m.geoms.push_back({geom_body.data()[g], read3(geom_pos.data() + 3 * g),
+                           readq(geom_quat.data() + 4 * g),
+                           make_shape(static_cast<ShapeKind>(shape.data()[g]),
+                                      read3(size.data() + 3 * g), std::move(hull))});
+    }
+    const auto pairs = column<int>(d, "pairs");
+    for (std::size_t i = 0; i + 1 < pairs.size(); i += 2)
+        m.pairs.push_back({pairs.data()[i], pairs.data()[i + 1]});
+    for (const nb::handle h : nb::cast<nb::list>(d["supports"])) {
+        const auto s = nb::cast<nb::dict>(h);
+        Support out;
+        out.position = read3(column<double>(s, "position").data());
+        const Mat3 R = read9(column<double>(s, "rotation").data());
+        out.x = R.col(0), out.y = R.col(1), out.normal = R.col(2);
+        out.friction = nb::cast<double>(s["friction"]);
+        out.geom = nb::cast<int>(s["geom"]);
+        const auto A = column<double>(s, "A");
+        out.b = list<double>(s, "b");
+        for (std::size_t k = 0; k < out.b.size(); ++k) out.A.push_back(read3(A.data() + 3 * k));
+        m.supports.push_back(std::move(out));
+    }
+    for (const nb::handle h : nb::cast<nb::list>(d["surfaces"])) {
+        const auto s = nb::cast<nb::dict>(h);
+        Surface out;
+        out.body = nb::cast<int>(s["body"]);
+        out.radius = nb::cast<double>(s["radius"]);
+        const auto corners = column<double>(s, "corners");
+        const int n = static_cast<int>(corners.size() / 3);
+        out.whole = touching_from(corners.data(), n);
+        out.whole.centre = read3(column<double>(s, "centre").data());
+        out.flat = nb::cast<bool>(s["flat"]);
+        if (out.flat) {
+            out.rotation = quat_from_matrix(read9(column<double>(s, "rotation").data()));
+            for (int k = 0; k < n; ++k) {
+                double ends[6];
+                std::copy_n(corners.data() + 3 * k, 3, ends);
+                std::copy_n(corners.data() + 3 * ((k + 1) % n), 3, ends + 3);
+                out.edges.push_back(touching_from(ends, 2));
+            }
+        }
+        out.mass_body = nb::cast<int>(s["mass_body"]);
+        out.mass_point = read3(column<double>(s, "mass_point").data());
+        m.touching.emplace_back();
+        for (const nb::handle t : nb::cast<nb::list>(s["touching"])) {
+            const auto both = nb::cast<nb::dict>(t);
+            m.touching.back().push_back(
+                {list<int>(both, "planned"), list<int>(both, "further")});
+        }
+        m.surfaces.push_back(std::move(out));
+    }
+    m.qadr = list<int>(d, "qadr");
+    m.dadr = list<int>(d, "dadr");
+    m.q_min = list<double>(d, "q_min");
+    m.q_max = list<double>(d, "q_max");
+    m.tau_max = list<double>(d, "tau_max");
+    if (!m.finish()) throw std::invalid_argument("bodies come after their parents");
+    return m;
+}
+
+void check_size(std::size_t n, std::size_t expected, const char* what) {
+    if (n != expected)
+        throw std::invalid_argument(std::string(what) + ": " + std::to_string(n) +
+                                    " numbers, expected " + std::to_string(expected));
+}
+
+int index(int i, std::size_t n, const char* what) {
+    if (i < 0 || static_cast<std::size_t>(i) >= n)
+        throw std::invalid_argument(std::string("no such ") + what);
+    return i;
+}
+
+// Rows (surface, support, edge, has link) and (position, quaternion, link).
+std::vector<Contact> read_contacts(const Model& m, const Array2<int>& what,
+                                   const Array2<>& where) {
+    check_size(where.shape(0), what.shape(0), "contacts");
+    if (what.shape(0)) check_size(what.shape(1) + where.shape(1), 4 + 11, "a contact");
+    std::vector<Contact> out(what.shape(0));
+    for (std::size_t i = 0; i < out.size(); ++i) {
+        const int* w = what.data() + 4 * i;
+        const double* x = where.data() + 11 * i;
+        Contact& c = out[i];
+        c.surface = index(w[0], m.surfaces.size(), "surface");
+        c.support = index(w[1], m.supports.size(), "support");
+        c.edge = w[2] < 0 ? -1 : index(w[2], m.surfaces[c.surface].edges.size(), "edge");
+        c.has_link = w[3] != 0;
+        c.position = read3(x);
+        c.quaternion = readq(x + 3);
+        c.link = readq(x + 7);
+    }
+    return out;
+}
+
+// Rows (kind, surface, support, edge, loaded, has link) and (position, rotation, link,
+// reference, stability, weight).
+void read_tasks(const Model& m, const Array2<int>& what, const Array2<>& where, Problem& p) {
+    check_size(where.shape(0), what.shape(0), "tasks");
+    if (what.shape(0)) check_size(what.shape(1) + where.shape(1), 6 + 19, "a task");
+    for (std::size_t i = 0; i < what.shape(0); ++i) {
+        const int* w = what.data() + 6 * i;
+        const double* x = where.data() + 19 * i;
+        SurfaceTask t;
+        t.kind = static_cast<TaskKind>(index(w[0], 4, "task"));
+        t.surface = index(w[1], m.surfaces.size(), "surface");
+        t.support = index(w[2], m.supports.size(), "support");
+        const std::size_t edges = m.surfaces[t.surface].edges.size();
+        t.edge = t.kind == TaskKind::OnEdge ? index(w[3], edges, "edge") : -1;
+        t.loaded = w[4] != 0;
+        t.has_link = w[5] != 0;
+        t.position = read3(x);
+        t.rotation = quat_from_matrix(read9(x + 3));
+        t.link = readq(x + 12);
+        t.reference = x[16];
+        t.stability = x[17];
+        t.weight = x[18];
+        p.tasks.push_back(t);
+    }
+}
+
+// Rows (first start, second start or -1, first end, second end or -1) of bodies, and the
+// four points in their frames, the direction and the weight.
+void read_pointing(const Model& m, const Array2<int>& what, const Array2<>& where,
+                   Problem& p) {
+    check_size(where.shape(0), what.shape(0), "directions");
+    if (what.shape(0)) check_size(what.shape(1) + where.shape(1), 4 + 16, "a direction");
+    for (std::size_t i = 0; i < what.shape(0); ++i) {
+        const int* w = what.data() + 4 * i;
+        const double* x = where.data() + 16 * i;
+        PointingTask t;
+        t.starts = w[1] < 0 ? 1 : 2;
+        t.ends = w[3] < 0 ? 1 : 2;
+        for (int k = 0; k < t.starts; ++k) {
+            t.start_body[k] = index(w[k], m.bodies.size(), "body");
+            t.start[k] = read3(x + 3 * k);
+        }
+        for (int k = 0; k < t.ends; ++k) {
+            t.end_body[k] = index(w[2 + k], m.bodies.size(), "body");
+            t.end[k] = read3(x + 6 + 3 * k);
+        }
+        t.direction = read3(x + 12);
+        t.weight = x[15];
+        p.pointing.push_back(t);
+    }
+}
+
+nb::tuple as_tuple(const Residuals& r) {
+    return nb::make_tuple(r.contact, r.distance, r.balance, r.limits, r.worst_pair,
+                          r.com_margin);
+}
+
+nb::tuple as_tuple(Path& p) {
+    return nb::make_tuple(static_cast<int>(p.status), p.phase, p.depth, p.pair,
+                          own(std::move(p.weak)));
+}
+
+// A planner with the model that it refers to, for one caller at a time.
+struct Workspace {
+    std::shared_ptr<const Model> model;
+    PathPlanner planner;
+    std::mutex busy;
+
+    Workspace(std::shared_ptr<const Model> m, const Array1<>& rough,
+              const Array1<unsigned char>& told)
+        : model(std::move(m)), planner(*model) {
+        check_size(rough.size(), model->pairs.size(), "rough");
+        check_size(told.size(), model->pairs.size(), "told");
+        Rows& rows = planner.solver.rows;
+        rows.rough.assign(rough.data(), rough.data() + rough.size());
+        rows.told.assign(told.data(), told.data() + told.size());
+    }
+
+    void read_contacts_of(Transition& t, const Array2<int>& held, const Array2<>& held_where,
+                          const Array2<int>& rolling, const Array2<>& rolling_where,
+                          const Array2<int>& made, const Array2<>& made_where) const {
+        t.held = read_contacts(*model, held, held_where);
+        t.rolling = read_contacts(*model, rolling, rolling_where);
+        const auto new_ones = read_contacts(*model, made, made_where);
+        t.makes = !new_ones.empty();
+        if (t.makes) t.made = new_ones[0];
+    }
+
+    const double* posture(const Array1<>& q) const {
+        check_size(q.size(), model->nq, "q");
+        return q.data();
+    }
+};
+
+}  // namespace
+
+void bind_posture(nb::module_& m) {
+    m.attr("EDGE_INSET") = EDGE_INSET;
+    m.attr("EDGE_ROOM") = EDGE_ROOM;
+    m.attr("EDGE_WEIGHT") = EDGE_WEIGHT;
+    m.attr("ROUGHNESS_WEIGHT") = ROUGHNESS_WEIGHT;
+    m.attr("STEP_ROTATION") = STEP_ROTATION;
+    m.attr("STEP_TRANSLATION") = STEP_TRANSLATION;
+    m.attr("ACTIVE_RANGE") = ACTIVE_RANGE;
+    m.attr("DAMPING") = DAMPING;
+    m.attr("PENALTY") = PENALTY;
+    m.attr("CONTACT_TOL") = CONTACT_TOL;
+    m.attr("LIMIT_TOL") = LIMIT_TOL;
+    m.attr("DISTANCE_TOL") = DISTANCE_TOL;
+    m.attr("MARGIN_TOL") = MARGIN_TOL;
+    m.attr("CLEARANCE") = CLEARANCE;
+    m.attr("FURTHER_CLEARANCE") = FURTHER_CLEARANCE;
+    m.attr("ARC_WEIGHT") = ARC_WEIGHT;
+    m.attr("DRIFT_LIMIT") = DRIFT_LIMIT;
+    m.attr("OVERLAP_LIMIT") = OVERLAP_LIMIT;
+    m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);
+    m.attr("PATH_OVERLAPS") = static_cast<int>(Path::Status::Overlaps);
+    m.attr("PATH_WEAK") = static_cast<int>(Path::Status::Weak);
+    m.def("arc",
+          [](const Array1<>& p1, const Array1<>& p2, double top, bool on_top, int points) {
+              check_size(p1.size() + p2.size(), 6, "ends");
+              std::vector<Vec3> arc_points;
+              arc(read3(p1.data()), read3(p2.data()), top, on_top, points, arc_points);
+              std::vector<double> out;
+              for (const Vec3& p : arc_points) out.insert(out.end(), {p.x, p.y, p.z});
+              return own(std::move(out), {arc_points.size(), 3});
+          },
+          "Control points of the arc between two contact points (4.29).");
+
+    nb::class_<std::shared_ptr<const Model>>(m, "Model", "Constants of a robot in a scene.")
+        .def("__init__", [](std::shared_ptr<const Model>* self, const nb::dict& d) {
+            new (self) std::shared_ptr<const Model>(
+                std::make_shared<const Model>(read_model(d)));
+        });
+
+    nb::class_<Problem>(m, "Problem", "What a posture must and should satisfy.")
+        .def("__init__",
+             [](Problem* self, const std::shared_ptr<const Model>& model,
+                const Array2<int>& tasks, const Array2<>& task_values,
+                const Array2<int>& pointing, const Array2<>& pointing_values,
+                const Array1<>& q_reference, const Array1<>& clearance,
+                std::optional<Array1<>> base_rotation, std::optional<Array1<>> com_target,
+                bool balance, const Array1<>& weights) {
+                 new (self) Problem();
+                 check_size(q_reference.size(), model->nq, "q_reference");
+                 check_size(clearance.size(), model->pairs.size(), "clearance");
+                 check_size(weights.size(), 5, "weights");
+                 read_tasks(*model, tasks, task_values, *self);
+                 read_pointing(*model, pointing, pointing_values, *self);
+                 self->q_reference.assign(q_reference.data(),
+                                          q_reference.data() + q_reference.size());
+                 self->clearance.assign(clearance.data(), clearance.data() + clearance.size());
+                 if (base_rotation) {
+                     check_size(base_rotation->size(), 9, "base_rotation");
+                     self->turned = true;
+                     self->base_rotation = quat_from_matrix(read9(base_rotation->data()));
+                 }
+                 if (com_target) {
+                     check_size(com_target->size(), 2, "com_target");
+                     self->over = true;
+                     self->com_target = {com_target->data()[0], com_target->data()[1]};
+                 }
+                 self->balance = balance;
+                 self->balance_margin = weights.data()[0];
+                 self->posture_weight = weights.data()[1];
+                 self->base_weight = weights.data()[2];
+                 self->com_weight = weights.data()[3];
+                 self->ellipse_weight = weights.data()[4];
+             },
+             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+             nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg());
+
+    nb::class_<Workspace>(m, "Workspace", "Solves postures and paths, one at a time.")
+        .def(nb::init<std::shared_ptr<const Model>, const Array1<>&,
+                      const Array1<unsigned char>&>())
+        .def("solve",
+             [](Workspace& w, const Problem& p, const Array1<>& q, int iterations,
+                double tolerance) {
+                 Solution out;
+                 const double* from = w.posture(q);
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.solver.solve(p, from, iterations, tolerance, out);
+                 }
+                 return nb::make_tuple(own(std::move(out.q)), out.iterations, out.converged,
+                                       as_tuple(out.residuals));
+             },
+             "Iterate from q: q, iterations, whether it converged, residuals.")
+        .def("solve_hard",
+             [](Workspace& w, const Problem& p, const Array1<>& q,
+                std::optional<Array1<>> hint) {
+                 Solution out;
+                 const double* from = w.posture(q);
+                 const double* first = hint ? w.posture(*hint) : nullptr;
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.solver.solve_hard(p, from, first, out);
+                 }
+                 return nb::make_tuple(own(std::move(out.q)), out.iterations, out.converged,
+                                       as_tuple(out.residuals));
+             },
+             nb::arg(), nb::arg(), nb::arg().none(),
+             "Solve with more than one way to get there.")
+        .def("residuals",
+             [](Workspace& w, const Problem& p, const Array1<>& q) {
+                 const std::lock_guard lock(w.busy);
+                 return as_tuple(w.planner.solver.residuals(p, w.posture(q)));
+             },
+             "How well q satisfies a problem.")
+        .def("build",
+             [](Workspace& w, const Problem& p, const Array1<>& q, double reach) {
+                 const std::lock_guard lock(w.busy);
+                 Solver& s = w.planner.solver;
+                 s.rows.ask(p);
+                 const double merit = s.look(p, w.posture(q), reach);
+                 s.linearise(p, q.data());
+                 const std::size_t nv = w.model->nv;
+                 const auto rows = [nv](const Block& b) {
+                     return own({b.J.begin(), b.J.begin() + b.n * nv},
+                                {static_cast<std::size_t>(b.n), nv});
+                 };
+                 const Block& closed = s.rows.closed;
+                 return nb::make_tuple(
+                     own(std::vector<double>(s.H), {nv, nv}), own(std::vector<double>(s.c)),
+                     rows(closed), own({closed.lo.begin(), closed.lo.begin() + closed.n}),
+                     rows(s.rows.kept), own(std::vector<double>(s.lower)),
+                     own(std::vector<double>(s.upper)), merit);
+             },
+             "The QP at q: H, c, closed rows and errors, kept rows, bounds, merit.")
+        .def("step",
+             [](Workspace& w, double radius) {
+                 const std::lock_guard lock(w.busy);
+                 std::vector<double> dq(w.model->nv);
+                 w.planner.solver.step(radius, dq.data());
+                 return own(std::move(dq));
+             },
+             "The solution of the QP that was built last.")
+        .def("is_stable",
+             [](Workspace& w, const Array2<int>& what, const Array2<>& where,
+                const Array1<>& q) {
+                 const auto contacts = read_contacts(*w.model, what, where);
+                 const std::lock_guard lock(w.busy);
+                 return w.planner.is_stable(contacts, w.posture(q));
+             },
+             "Whether forces and torques that are counted on hold the robot at q.")
+        .def("holding_torques",
+             [](Workspace& w, const Array2<int>& what, const Array2<>& where,
+                const Array2<>& prices, const Array2<>& q) {
+                 const auto all = read_contacts(*w.model, what, where);
+                 const std::size_t n = q.shape(0), na = w.model->dadr.size();
+                 check_size(prices.shape(0), n, "prices");
+                 check_size(prices.shape(1), all.size(), "prices");
+                 check_size(q.shape(1), w.model->nq, "q");
+                 std::vector<double> out(n * na);
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     std::vector<Contact> bearing;
+                     std::vector<double> price;
+                     for (std::size_t i = 0; i < n; ++i) {
+                         bearing.clear();
+                         price.clear();
+                         for (std::size_t k = 0; k < all.size(); ++k) {
+                             const double p = prices.data()[i * all.size() + k];
+                             if (!(p > 0.0)) continue;
+                             bearing.push_back(all[k]);
+                             price.push_back(p);
+                         }
+                         w.planner.holding_torques(bearing, price.data(),
+                                                   q.data() + i * w.model->nq,
+                                                   out.data() + i * na);
+                     }
+                 }
+                 return own(std::move(out), {n, na});
+             },
+             "(n, na) torques that hold postures (n, nq), contacts at prices (n, k) or 0.")
+        .def("bridge",
+             [](Workspace& w, const Array1<>& a, const Array1<>& b, const Array2<int>& what,
+                const Array2<>& where) {
+                 const auto contacts = read_contacts(*w.model, what, where);
+                 const std::size_t nq = w.model->nq;
+                 const std::vector<double> from(w.posture(a), a.data() + nq);
+                 const std::vector<double> to(w.posture(b), b.data() + nq);
+                 Postures out;
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.bridge(from, to, contacts, out);
+                 }
+                 return stacked(out, nq);
+             },
+             "Postures from one to another with contacts closed, near the straight way.")
+        .def("path",
+             [](Workspace& w, const std::vector<Array1<>>& postures,
+                const Array2<int>& held, const Array2<>& held_where,
+                const Array2<int>& rolling, const Array2<>& rolling_where,
+                const Array2<int>& made, const Array2<>& made_where, double margin,
+                bool adapt) {
+                 check_size(postures.size(), 4, "postures");
+                 Transition t;
+                 w.read_contacts_of(t, held, held_where, rolling, rolling_where, made,
+                                    made_where);
+                 std::vector<double>* const parts[4] = {&t.before, &t.shifted, &t.touching,
+                                                        &t.after};
+                 for (int k = 0; k < 4; ++k) {
+                     const double* q = w.posture(postures[k]);
+                     parts[k]->assign(q, q + w.model->nq);
+                 }
+                 t.margin = margin;
+                 t.adapt = adapt;
+                 Path out;
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.plan(t, out);
+                 }
+                 std::vector<double> control;
+                 for (const Vec3& p : out.control) control.insert(control.end(), {p.x, p.y, p.z});
+                 const std::size_t n = out.control.size(), nq = w.model->nq;
+                 return nb::make_tuple(stacked(out.phases[0], nq), stacked(out.phases[1], nq),
+                                       stacked(out.phases[2], nq),
+                                       own(std::move(control), {n, 3}), as_tuple(out));
+             },
+             "Postures of shift, swing and settle, the arc's control points, the verdict.")
+        .def("check_path",
+             [](Workspace& w, const std::vector<Array2<>>& phases, const Array2<int>& held,
+                const Array2<>& held_where, const Array2<int>& rolling,
+                const Array2<>& rolling_where, const Array2<int>& made,
+                const Array2<>& made_where) {
+                 check_size(phases.size(), 3, "phases");
+                 Transition t;
+                 w.read_contacts_of(t, held, held_where, rolling, rolling_where, made,
+                                    made_where);
+                 Path out;
+                 for (int k = 0; k < 3; ++k)
+                     for (std::size_t i = 0; i < phases[k].shape(0); ++i) {
+                         check_size(phases[k].shape(1), w.model->nq, "q");
+                         const double* q = phases[k].data() + i * w.model->nq;
+                         out.phases[k].emplace_back(q, q + w.model->nq);
+                     }
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.check(t, out);
+                 }
+                 return as_tuple(out);
+             },
+             "What is wrong with the postures of a path.");
+}
+
+}  // namespace clamber
