@@ -26,7 +26,6 @@ from clamber.step.posture import CLEARANCE
 from clamber.step.stability import contact_drift, contact_points
 from clamber.step.transition import plan_transition
 
-
 SAFE_HEIGHT, TOP_RISE = 0.05, 0.05  # [m] h_safe of (4.29); of arcs on top
 
 

@@ -154,7 +154,7 @@ _IDENTITY = (1.0, 0.0, 0.0, 0.0)
 def packed_tasks(
     world: World, tasks: Sequence[SurfaceTask]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 6) kinds, surfaces, supports, edges, flags, and (n, 19) what goes with them."""
+    """(n, 6) kinds, surfaces, supports, edges, flags, and (n, 19) numbers."""
     surfaces, supports = list(world.surfaces), list(world.supports)
     what = np.empty((len(tasks), 6), np.int32)
     where = np.empty((len(tasks), 19))
@@ -182,7 +182,7 @@ def packed_tasks(
 def packed_contacts(
     world: World, contacts: Sequence[Contact]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 4) surfaces, supports, edges, flags, and (n, 11) what goes with them."""
+    """(n, 4) surfaces, supports, edges, flags, and (n, 11) numbers."""
     surfaces, supports = list(world.surfaces), list(world.supports)
     what = np.empty((len(contacts), 4), np.int32)
     where = np.empty((len(contacts), 11))
@@ -198,8 +198,8 @@ def packed_contacts(
     return what, where
 
 
-# From the middle of one or two places (body, point (3,) in its frame) to that of others,
-# in a direction (3,) of the world, with a weight.
+# From the middle of one or two places (body, point (3,) in its frame) to that of
+# others, in a direction (3,) of the world, with a weight.
 Pointing = tuple[
     Sequence[tuple[int, np.ndarray]],
     Sequence[tuple[int, np.ndarray]],
