@@ -180,6 +180,5 @@ class ContactSequence:
             raise ValueError("times must increase, one more than there are stances")
         t.setflags(write=False)
         object.__setattr__(self, "t", t)
-        for s in self.stances:
-            for c in s.contacts:
-                self.scene.support(c.support)
+        for name in dict.fromkeys(c.support for s in self.stances for c in s.contacts):
+            self.scene.support(name)

@@ -291,6 +291,7 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
     surfaces = {s: _surface(model, data, s) for s in robot.surfaces}
     pairs = _pairs(model, data, base)
     home = _stand_clear(model, data, robot, scene, home, surfaces, pairs)
+    supports = {s.name: s for s in scene.supports}
     return World(
         model=model,
         xml=xml,
@@ -312,18 +313,18 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         kd=gains[:, 1],
         ki=gains[:, 2],
         pairs=pairs,
-        support_geom={s.name: model.geom(s.name).id for s in scene.supports},
+        support_geom={name: model.geom(name).id for name in supports},
         support_of_geom={
-            g: s.name
-            for s in scene.supports
+            g: name
+            for name in supports
             for g in range(model.ngeom)
-            if model.geom_bodyid[g] == 0 and has_prefix(model.geom(g).name, s.name)
+            if model.geom_bodyid[g] == 0 and has_prefix(model.geom(g).name, name)
         },
-        supports={s.name: s for s in scene.supports},
+        supports=supports,
         touching={
-            (name, s.name): _touching(model, pairs, surface, model.geom(s.name).id)
+            (name, support): _touching(model, pairs, surface, model.geom(support).id)
             for name, surface in surfaces.items()
-            for s in scene.supports
+            for support in supports
         },
         base=base,
         mass=float(model.body_subtreemass[base]),
