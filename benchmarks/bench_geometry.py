@@ -14,7 +14,8 @@ import time
 import mujoco
 import numpy as np
 
-from clamber.model.kinematics import SHAPES, Kinematics, near_pairs
+from clamber.model.core import SHAPES, near_pairs
+from clamber.model.kinematics import Kinematics
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import build_world

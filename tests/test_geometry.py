@@ -15,7 +15,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clamber import _core
-from clamber.model.kinematics import SHAPES, Kinematics, near_pairs
+from clamber.model.core import SHAPES, near_pairs
+from clamber.model.kinematics import Kinematics
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import build_world

@@ -783,19 +783,6 @@ def test_limb_lengths_are_distances_between_joints(kin):
     assert again == pytest.approx(lengths)
 
 
-def test_a_flat_error_is_the_turn_that_would_lay_it_flat(world):
-    kin = Kinematics(world)
-    for seed in range(5):
-        kin.update(random_posture(world, seed))
-        s = world.surfaces["RFoot"]
-        now = kin.rotation(s.body) @ s.rotation
-        goal = matrix_from_rpy([0.1, -0.2, 0.3]) @ now
-        turn = Rotation.from_rotvec(kin.flat_error("RFoot", goal)).as_matrix()
-        np.testing.assert_allclose(turn @ now, goal, atol=1e-9)
-    with pytest.raises(ValueError, match="point surface"):
-        kin.flat_error("LHand", np.eye(3))
-
-
 # Distances that are not looked at.
 
 
@@ -815,29 +802,3 @@ def test_what_was_seen_before_does_not_change_what_is_near(tilted, size):
         np.testing.assert_array_equal(a.pairs, b.pairs)
         np.testing.assert_array_equal(a.distance, b.distance)
         np.testing.assert_array_equal(a.first, b.first)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_distances_change_as_their_jacobian_says(tilted, seed):
-    kin, q = Kinematics(tilted), random_posture(tilted, seed)
-    kin.update(q)
-    near = kin.proximity(0.15)
-    J = kin.distance_jacobian(near.pairs, near.first, near.normal)
-    other = kin.distance_jacobian(near.pairs, near.second, near.normal)
-    np.testing.assert_allclose(J, other, atol=1e-9)
-    # Round against flat, apart: elsewhere the nearest points jump.
-    m = tilted.model
-    kinds = m.geom_type[tilted.pairs[near.pairs]]
-    smooth = (kinds != mujoco.mjtGeom.mjGEOM_BOX).all(axis=1) & (near.distance > 0.02)
-    rng, h = np.random.default_rng(seed), 1e-6
-    for _ in range(3):
-        v = rng.normal(size=m.nv)
-        found = {}
-        for sign in (1.0, -1.0):
-            kin.update(kin.integrate(q, sign * h * v))
-            p = kin.proximity(0.2)
-            found[sign] = dict(zip(p.pairs.tolist(), p.distance, strict=True))
-        for i in np.flatnonzero(smooth):
-            pair = int(near.pairs[i])
-            slope = (found[1.0][pair] - found[-1.0][pair]) / (2 * h)
-            assert J[i] @ v == pytest.approx(slope, abs=2e-3)

@@ -9,19 +9,19 @@ import mujoco
 import numpy as np
 
 from clamber import _core
+from clamber.errors import InputError
 from clamber.model.world import World
 
-# The kinds of shapes in the core's order; whatever is no plain shape is a hull.
-_GEOM = mujoco.mjtGeom
-_SHAPES = (
-    _GEOM.mjGEOM_PLANE,
-    _GEOM.mjGEOM_SPHERE,
-    _GEOM.mjGEOM_CAPSULE,
-    _GEOM.mjGEOM_ELLIPSOID,
-    _GEOM.mjGEOM_CYLINDER,
-    _GEOM.mjGEOM_BOX,
+# The core's kinds of shape, in its order.
+SHAPES = (
+    mujoco.mjtGeom.mjGEOM_PLANE,
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_BOX,
+    mujoco.mjtGeom.mjGEOM_MESH,
 )
-_CONVEX = len(_SHAPES)
 _MODELS: WeakKeyDictionary[World, _core.Model] = WeakKeyDictionary()
 
 
@@ -34,7 +34,7 @@ def core_of(world: World) -> _core.Model:
 
 def _constants(world: World) -> dict[str, Any]:
     m, supports = world.model, list(world.supports)
-    kinds, vertices = shapes_of(m)
+    kinds, vertices = _shapes(m, world.pairs)
     landmarks = {s: world.landmark(world.robot.limb_of(s).root) for s in world.surfaces}
     return {
         "nq": m.nq,
@@ -100,18 +100,38 @@ def _constants(world: World) -> dict[str, Any]:
     }
 
 
-def shapes_of(model: mujoco.MjModel) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Kinds (ngeom,) of all geoms for the core, and the vertices (k, 3) of hulls."""
-    kinds, vertices = [], []
-    for g in range(model.ngeom):
-        kind, points = mujoco.mjtGeom(int(model.geom_type[g])), np.zeros((0, 3))
-        if kind == _GEOM.mjGEOM_MESH:
-            mesh = int(model.geom_dataid[g])
-            first, n = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-            points = _real(model.mesh_vert[first : first + n])
-        kinds.append(_SHAPES.index(kind) if kind in _SHAPES else _CONVEX)
-        vertices.append(points)
-    return np.array(kinds, np.int32), vertices
+def near_pairs(model: mujoco.MjModel, pairs: np.ndarray) -> _core.Proximity:
+    """A workspace that finds which pairs (P, 2) of a model's geoms are near."""
+    kinds, vertices = _shapes(model, pairs)
+    return _core.Proximity(kinds, model.geom_size, vertices, _whole(pairs))
+
+
+def _shapes(
+    model: mujoco.MjModel, pairs: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Kinds (ngeom,) of those geoms that are in pairs, and vertices (k, 3) of hulls."""
+    kinds = np.zeros(model.ngeom, dtype=np.int32)
+    vertices = [np.zeros((0, 3))] * model.ngeom
+    for g in np.unique(pairs):
+        kind = mujoco.mjtGeom(int(model.geom_type[g]))
+        if kind not in SHAPES:
+            known = [k.name for k in SHAPES]
+            raise InputError("a shape with distances", None, kind.name, known)
+        kinds[g] = SHAPES.index(kind)
+        if kind == mujoco.mjtGeom.mjGEOM_MESH:
+            vertices[g] = _hull(model, int(model.geom_dataid[g]))
+    return kinds, vertices
+
+
+def _hull(model: mujoco.MjModel, mesh: int) -> np.ndarray:
+    """(k, 3) vertices of a mesh's convex hull, all of them where it has none."""
+    first = model.mesh_vertadr[mesh]
+    points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
+    at = int(model.mesh_graphadr[mesh])
+    if at < 0:
+        return points
+    n = int(model.mesh_graph[at])
+    return points[model.mesh_graph[at + 2 + n : at + 2 + 2 * n]]
 
 
 def _real(x: np.ndarray) -> np.ndarray:

@@ -6,28 +6,16 @@ base.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from clamber import _core
-from clamber.errors import InputError
+from clamber.model.core import core_of, near_pairs
 from clamber.model.records import short_repr
-from clamber.model.se3 import rotation_vector
-from clamber.model.world import World, chain_up
-
-_YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
-# The core's kinds of shape, in its order.
-SHAPES = (
-    mujoco.mjtGeom.mjGEOM_PLANE,
-    mujoco.mjtGeom.mjGEOM_SPHERE,
-    mujoco.mjtGeom.mjGEOM_CAPSULE,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    mujoco.mjtGeom.mjGEOM_CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX,
-    mujoco.mjtGeom.mjGEOM_MESH,
-)
+from clamber.model.world import World
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -48,33 +36,6 @@ class Proximity:
     second: np.ndarray
 
     __repr__ = short_repr
-
-
-def near_pairs(model: mujoco.MjModel, pairs: np.ndarray) -> _core.Proximity:
-    """A workspace that finds which pairs (P, 2) of a model's geoms are near."""
-    kinds = np.zeros(model.ngeom, dtype=np.int32)
-    vertices = [np.zeros((0, 3))] * model.ngeom
-    for g in np.unique(pairs):
-        kind = mujoco.mjtGeom(int(model.geom_type[g]))
-        if kind not in SHAPES:
-            known = [k.name for k in SHAPES]
-            raise InputError("a shape with distances", None, kind.name, known)
-        kinds[g] = SHAPES.index(kind)
-        if kind == mujoco.mjtGeom.mjGEOM_MESH:
-            vertices[g] = _hull(model, int(model.geom_dataid[g]))
-    pairs = np.ascontiguousarray(pairs, dtype=np.int32)
-    return _core.Proximity(kinds, model.geom_size, vertices, pairs)
-
-
-def _hull(model: mujoco.MjModel, mesh: int) -> np.ndarray:
-    """(k, 3) vertices of a mesh's convex hull, all of them where it has none."""
-    first = model.mesh_vertadr[mesh]
-    points = model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(float)
-    at = int(model.mesh_graphadr[mesh])
-    if at < 0:
-        return points
-    n = int(model.mesh_graph[at])
-    return points[model.mesh_graph[at + 2 + n : at + 2 + 2 * n]]
 
 
 class Kinematics:
@@ -98,18 +59,13 @@ class Kinematics:
         self._xmat = self.data.xmat.reshape(-1, 3, 3)
         self._xquat = self.data.xquat
         self._com = self.data.subtree_com[world.base]
-        # (nbody, nv): the dofs that move a body.
-        self._moves = np.zeros((m.nbody, m.nv))
-        for body in range(m.nbody):
-            for b in chain_up(m, body):
-                first = int(m.body_dofadr[b])
-                self._moves[body, first : first + int(m.body_dofnum[b])] = 1.0
-        body = m.geom_bodyid[world.pairs]
-        self._pair_moves = self._moves[body[:, 1]] - self._moves[body[:, 0]]
-        # Motion of the dofs about `_root`, as MuJoCo keeps it.
-        self._cdof = self.data.cdof
-        self._root = self.data.subtree_com[m.body_rootid[world.base]]
         self._landmarks: dict[str, tuple[int, np.ndarray]] = {}
+
+    @functools.cached_property
+    def core(self) -> _core.Workspace:
+        """A workspace of the native core, without clearances beyond those asked for."""
+        nothing = np.zeros(len(self.world.pairs))
+        return _core.Workspace(core_of(self.world), nothing, nothing.astype(np.uint8))
 
     def update(self, q: np.ndarray) -> None:
         """Run forward kinematics for `q` (nq,)."""
@@ -199,13 +155,6 @@ class Kinematics:
         nx, ny, nz = normal.tolist()
         return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
 
-    def flat_error(self, surface: str, R_WC: np.ndarray) -> np.ndarray:
-        """(3,) world rotation vector from the surface's frame to the contact frame."""
-        s = self.world.surfaces[surface]
-        if s.rotation is None:
-            raise ValueError(f"{surface} is a point surface: it has no orientation")
-        return rotation_vector(R_WC @ (self._xmat[s.body] @ s.rotation).T)
-
     def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
         """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them."""
         d = self.data
@@ -215,23 +164,6 @@ class Kinematics:
         return Proximity(
             pairs=pairs, distance=distance, normal=normal, first=first, second=second
         )
-
-    def distance_jacobian(
-        self, pairs: np.ndarray, points: np.ndarray, normals: np.ndarray
-    ) -> np.ndarray:
-        """(m, nv) how distances change with the configuration.
-
-        The points of a pair lie on one normal, about which turning moves neither
-        along it: one wrench serves both, of each body where its dofs move it.
-
-        Args:
-            pairs: (m,) indices into `World.pairs`.
-            points: (m, 3) on one of the geoms, in the world.
-            normals: (m, 3) from the first geom to the second.
-        """
-        arm = points - self._root
-        wrench = np.concatenate([_cross(arm, normals), normals], axis=1)
-        return (wrench @ self._cdof.T) * self._pair_moves.take(pairs, axis=0)
 
     def integrate(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """(nq,) `q` moved along the tangent vector `v` (nv,) for unit time."""
@@ -253,11 +185,6 @@ class Kinematics:
         out = np.empty(m.nv)
         mujoco.mj_rne(m, d, 0, out)
         return out
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(m, 3) vector products; `np.cross` costs ten times as much on a few rows."""
-    return a.take(_YZX, 1) * b.take(_ZXY, 1) - a.take(_ZXY, 1) * b.take(_YZX, 1)
 
 
 def limb_lengths(kin: Kinematics) -> dict[str, float]:

@@ -30,8 +30,9 @@ from clamber.planning.timing import GRID, demand_at, least_torques, retime
 from clamber.step.change import Change
 from clamber.step.path import Phase
 from clamber.step.polygon import com_margins, support_polygon
-from clamber.step.stability import contact_points, torque_limits
-from clamber.step.statics import GRAVITY, Load, contact_forces
+from clamber.step.stability import contact_points
+from clamber.step.statics import GRAVITY
+from clamber.step.tasks import packed_contacts
 
 RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
@@ -190,62 +191,58 @@ def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
     """(n, na) torques that hold each posture of a phase, load handed over along it."""
     share = _arclength(kin, phase.q)
     share = share / share[-1] if share[-1] > 0 else share
-    return np.array(
-        [
-            holding_torque(kin, q, *handed_over(phase, float(s)))
-            for q, s in zip(phase.q, share, strict=True)
-        ]
-    )
+    contacts, prices = handed_over(phase, share)
+    return holding_torques(kin, phase.q, contacts, prices)
 
 
-def handed_over(phase: Phase, share: float) -> tuple[tuple[Contact, ...], np.ndarray]:
-    """Contacts (n of them) that may bear at a share of a phase, and prices of force.
+def handed_over(
+    phase: Phase, share: np.ndarray
+) -> tuple[tuple[Contact, ...], np.ndarray]:
+    """Contacts (k of them) that may bear, and prices of force (n, k), at shares (n,).
 
     The price of a contact that only bears at the start is 1 / (1 - share), of one that
-    only bears at the end 1 / share, of others 1: load passes from the ones to the
-    others, but only as far as the robot's balance allows. While the centre of mass is
-    not yet over the contacts that stay, those that leave go on bearing.
+    only bears at the end 1 / share, of others 1, and 0 where it does not bear: load
+    passes from the ones to the others, but only as far as the robot's balance allows.
+    While the centre of mass is not yet over the contacts that stay, those that leave go
+    on bearing.
     """
     before = {(c.surface, c.edge): c for c in phase.load_before}
     after = {(c.surface, c.edge): c for c in phase.load_after}
-    contacts, price = [], []
-    for key, c in {**before, **after}.items():
-        left = 1.0 - share * (key not in after) - (1.0 - share) * (key not in before)
-        if left > LEAST_SHARE:
-            contacts.append(c)
-            price.append(1.0 / left)
-    return tuple(contacts), np.array(price)
+    both = {**before, **after}
+    left = np.ones((len(share), len(both)))
+    for k, key in enumerate(both):
+        left[:, k] -= share * (key not in after) + (1.0 - share) * (key not in before)
+    bears = left > LEAST_SHARE
+    return tuple(both.values()), np.divide(1.0, left, where=bears, out=0.0 * left)
 
 
-def holding_torque(
+def holding_torques(
     kin: Kinematics,
     q: np.ndarray,
     contacts: Sequence[Contact],
-    price: np.ndarray | None = None,
+    prices: np.ndarray | None = None,
 ) -> np.ndarray:
-    """(na,) joint torques that balance gravity with the least contact forces.
+    """(n, na) joint torques that balance gravity with the least contact forces.
 
     Where these ask more of a joint than its `holding_limits`, those that do not:
     a weak wrist leaves the load to the feet.
 
     Args:
         kin: Workspace.
-        q: (nq,).
-        contacts: n that may bear.
-        price: (n,) of the force of each; None: 1 each.
+        q: (n, nq).
+        contacts: k that may bear.
+        prices: (n, k) of the force of each, 0 where it does not bear; None: 1 each.
     """
-    w = kin.world
-    kin.update(q)
-    points, load = contact_points(kin, contacts), Load(com=kin.com.copy(), mass=w.mass)
-    limits = torque_limits(kin, points)
-    prices = None if price is None else point_prices(kin, contacts, price)
-    tau = np.zeros(len(w.dadr))
-    for torque in (None, limits):
-        found = contact_forces(points, load, torque=torque, price=prices)
-        tau = limits.torques(found.forces)
-        if np.all(np.abs(tau) <= limits.limits):
-            break
-    return np.clip(tau, -w.tau_max, w.tau_max)
+    if prices is None:
+        prices = np.ones((len(q), len(contacts)))
+    return kin.core.holding_torques(*packed_contacts(kin.world, contacts), prices, q)
+
+
+def holding_torque(
+    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
+) -> np.ndarray:
+    """(na,) `holding_torques` of one posture (nq,)."""
+    return holding_torques(kin, q[None], contacts)[0]
 
 
 def point_prices(
@@ -421,10 +418,12 @@ def _fastest(
     q, slope = _on_manifold(raw, spline.curve(s[look], 1))
     bend = _bend(spline.curve, s[look])
     tau = []
+    every, price_of = handed_over(phase, s[look] / spline.length)
     for i, k in enumerate(look):
-        contacts, price = handed_over(phase, float(s[k]) / spline.length)
+        bears = np.flatnonzero(price_of[i])
+        contacts = tuple(every[j] for j in bears)
         demand = demand_at(kin, q[i], slope[i], bend[i], contacts)
-        prices = point_prices(kin, contacts, price)
+        prices = point_prices(kin, contacts, price_of[i, bears])
         squared = float(rate[k] ** 2)
         tau.append(least_torques(kin, demand, float(change[k]), squared, prices))
     return s, rate, make_interp_spline(look, np.array(tau), k=1)(np.arange(len(s)))

@@ -25,7 +25,7 @@ from clamber.errors import InputError, read_yaml
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
-from clamber.planning.trajectory import holding_torque
+from clamber.planning.trajectory import holding_torques
 
 SPEED = 0.5  # [rad/s] of the fastest joint
 PEAK = 1.875  # largest over mean speed of a minimum-jerk motion
@@ -129,10 +129,8 @@ def lead_in_motion(
     v[:, world.dadr] = slope[:, None] * way
     kin = Kinematics(world)
     nodes = np.linspace(0.0, 1.0, TORQUE_NODES)
-    held = [
-        holding_torque(kin, _between(world, measured, first, x), stance)
-        for x in nodes[:-1]
-    ]
+    between = np.array([_between(world, measured, first, x) for x in nodes[:-1]])
+    held = holding_torques(kin, between, stance)
     columns = np.transpose([*held, motion.tau[0]])
     torques = [np.interp(s, nodes, column) for column in columns]
     return States(q=q, v=v, tau=np.stack(torques, axis=1))
