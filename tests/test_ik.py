@@ -1143,6 +1143,24 @@ def test_where_nothing_satisfies_all_no_step_is_left_that_would_help(plain):
         assert plain.build(problem, trial).merit > 0.9 * qp.merit
 
 
+def test_a_solve_is_its_steps_in_a_trust_region(plain):
+    """What a step that was taken back looked at has no part in the next one."""
+    hand = Closed(contact=hand_on_box(0.5, -0.05), rotation=np.eye(3))
+    problem = stance_problem(plain, tasks=(*stance_problem(plain).tasks[:2], hand))
+    x, radius, taken_back = plain.world.home, 1.0, 0
+    for n in range(1, 16):
+        dq = plain.step(problem, x, radius)
+        trial = plain.kin.integrate(x, dq)
+        merit, before = (plain.build(problem, y).merit for y in (trial, x))
+        if n == 1 or merit <= before:
+            x, radius = trial, min(2.0 * radius, 1.0)
+        else:
+            radius, taken_back = 0.25 * radius, taken_back + 1
+    assert taken_back >= 2
+    found = plain.solve(problem, plain.world.home, iterations=15, tolerance=0.0)
+    np.testing.assert_allclose(found.q, x, atol=1e-5)
+
+
 def test_the_same_question_has_the_same_answer_to_the_bit(plain):
     problem = stance_problem(plain)
     first = plain.solve(problem, plain.world.home)

@@ -1,5 +1,7 @@
 """Native core: inner loops of kinematics, distances, postures, paths, statics."""
 
+from typing import Any
+
 import numpy as np
 
 def support_polygon(points: np.ndarray) -> np.ndarray:
@@ -314,3 +316,144 @@ def has_fallen(
     q: np.ndarray, reference: np.ndarray, tilt: float, height: float
 ) -> bool:
     """The base has tilted [rad] or sunk [m] that far from its reference."""
+EDGE_INSET: float
+EDGE_ROOM: float
+EDGE_WEIGHT: float
+ROUGHNESS_WEIGHT: float
+STEP_ROTATION: float
+STEP_TRANSLATION: float
+ACTIVE_RANGE: float
+DAMPING: float
+PENALTY: float
+CONTACT_TOL: float
+LIMIT_TOL: float
+DISTANCE_TOL: float
+MARGIN_TOL: float
+CLEARANCE: float
+FURTHER_CLEARANCE: float
+ARC_WEIGHT: float
+DRIFT_LIMIT: float
+OVERLAP_LIMIT: float
+PATH_OPENS: int
+PATH_OVERLAPS: int
+PATH_WEAK: int
+
+# Contact, distance, balance, limits, worst pair, margin of the centre of mass.
+_Residuals = tuple[float, float, float, float, int, float]
+# Status, phase, depth or opening, pair, the posture that cannot be held.
+_Verdict = tuple[int, int, float, int, np.ndarray]
+
+def arc(
+    p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int
+) -> np.ndarray:
+    """Control points (n, 3) of the arc between two contact points (4.29)."""
+
+class Model:
+    """Constants of a robot in a scene."""
+
+    def __init__(self, constants: dict[str, Any]) -> None:
+        """As `clamber.model.core` puts them together."""
+
+class Problem:
+    """What a posture must and should satisfy."""
+
+    def __init__(
+        self,
+        model: Model,
+        tasks: np.ndarray,
+        task_values: np.ndarray,
+        pointing: np.ndarray,
+        pointing_values: np.ndarray,
+        q_reference: np.ndarray,
+        clearance: np.ndarray,
+        base_rotation: np.ndarray | None,
+        com_target: np.ndarray | None,
+        balance: bool,
+        weights: np.ndarray,
+    ) -> None:
+        """Rows of tasks as `clamber.step.tasks` packs them; five weights."""
+
+class Workspace:
+    """Solves postures and paths, one at a time."""
+
+    def __init__(self, model: Model, rough: np.ndarray, told: np.ndarray) -> None:
+        """Further clearance (P,) [m] of pairs, and (P,) uint8: those told to."""
+
+    def solve(
+        self, problem: Problem, q: np.ndarray, iterations: int, tolerance: float
+    ) -> tuple[np.ndarray, int, bool, _Residuals]:
+        """Iterate from q: q, iterations, whether it converged, residuals."""
+
+    def solve_hard(
+        self, problem: Problem, q: np.ndarray, hint: np.ndarray | None
+    ) -> tuple[np.ndarray, int, bool, _Residuals]:
+        """Solve with more than one way to get there."""
+
+    def residuals(self, problem: Problem, q: np.ndarray) -> _Residuals:
+        """How well q satisfies a problem."""
+
+    def build(
+        self, problem: Problem, q: np.ndarray, reach: float
+    ) -> tuple[
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        float,
+    ]:
+        """The QP at q: H, c, closed rows and errors, kept rows, bounds, merit."""
+
+    def step(self, radius: float) -> np.ndarray:
+        """The solution of the QP that was built last."""
+
+    def is_stable(
+        self, contacts: np.ndarray, contact_values: np.ndarray, q: np.ndarray
+    ) -> bool:
+        """Whether forces and torques that are counted on hold the robot at q."""
+
+    def holding_torques(
+        self,
+        contacts: np.ndarray,
+        contact_values: np.ndarray,
+        prices: np.ndarray,
+        q: np.ndarray,
+    ) -> np.ndarray:
+        """(n, na) torques that hold postures (n, nq); prices (n, k), or 0."""
+
+    def bridge(
+        self,
+        a: np.ndarray,
+        b: np.ndarray,
+        contacts: np.ndarray,
+        contact_values: np.ndarray,
+    ) -> np.ndarray:
+        """Postures from one to another with contacts closed, near the straight way."""
+
+    def path(
+        self,
+        postures: list[np.ndarray],
+        held: np.ndarray,
+        held_values: np.ndarray,
+        rolling: np.ndarray,
+        rolling_values: np.ndarray,
+        made: np.ndarray,
+        made_values: np.ndarray,
+        margin: float,
+        adapt: bool,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Verdict]:
+        """Postures of shift, swing, settle, the arc's control points, a verdict."""
+
+    def check_path(
+        self,
+        phases: list[np.ndarray],
+        held: np.ndarray,
+        held_values: np.ndarray,
+        rolling: np.ndarray,
+        rolling_values: np.ndarray,
+        made: np.ndarray,
+        made_values: np.ndarray,
+    ) -> _Verdict:
+        """What is wrong with the postures of a path."""

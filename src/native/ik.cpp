@@ -92,11 +92,14 @@ void Solver::linearise(const Problem& problem, const double* q) {
     }
     std::copy(rows.kept.lo.begin(), rows.kept.lo.begin() + rows.kept.n, lower.begin() + nv);
     std::copy(rows.kept.hi.begin(), rows.kept.hi.begin() + rows.kept.n, upper.begin() + nv);
+    kept_.swap(rows.kept.J);
+    closed_.swap(rows.closed.J);
+    errors_.assign(rows.closed.lo.begin(), rows.closed.lo.begin() + rows.closed.n);
     // What is closed weighs as much as what is kept, as a penalty in the cost: as
     // equalities, contacts would close at the cost of distances.
     heavy_ = H;
-    for (int i = 0; i < rows.closed.n; ++i)
-        add_square(rows.closed.row(i), nv, PENALTY, heavy_.data(), nonzero_);
+    for (std::size_t i = 0; i < errors_.size(); ++i)
+        add_square(closed_.data() + i * nv, nv, PENALTY, heavy_.data(), nonzero_);
     for (int i = 0; i < nv; ++i)
         for (int j = 0; j < i; ++j) {
             H[i * nv + j] = H[j * nv + i];
@@ -122,9 +125,9 @@ void Solver::step(double radius, double* dq) {
         high_[d] = std::min(high_[d], radius * largest_[d]);
     }
     gradient_ = c;
-    for (int i = 0; i < rows.closed.n; ++i) {
-        const double e = PENALTY * std::min(std::max(rows.closed.lo[i], -reach), reach);
-        const double* row = rows.closed.row(i);
+    for (std::size_t i = 0; i < errors_.size(); ++i) {
+        const double e = PENALTY * std::min(std::max(errors_[i], -reach), reach);
+        const double* row = closed_.data() + i * nv;
         for (int d = 0; d < nv; ++d) gradient_[d] -= row[d] * e;
     }
     QP qp;
@@ -132,7 +135,7 @@ void Solver::step(double radius, double* dq) {
     qp.m = m;
     qp.H = heavy_.data();
     qp.c = gradient_.data();
-    qp.A = rows.kept.J.data();
+    qp.A = kept_.data();
     qp.upper = high_.data();
     qp.lower = low_.data();
     qp.sense = sense_.data();

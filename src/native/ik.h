@@ -66,7 +66,12 @@ class Solver {
     Rows rows;
     Proximity near;
     // The QP: H and c without contacts, bounds on the step, then those of the kept rows.
+    // The rows of a rejected trial are others: those of the QP are its own.
     std::vector<double> H, c, lower, upper;
+
+    const std::vector<double>& closed_rows() const { return closed_; }
+    const std::vector<double>& kept_rows() const { return kept_; }
+    const std::vector<double>& errors() const { return errors_; }
 
   private:
     struct Descent {
@@ -79,6 +84,7 @@ class Solver {
 
     QPSolver qp_;
     std::vector<double> largest_;  // step of each dof
+    std::vector<double> kept_, closed_, errors_;  // Jacobians, and what is to be closed
     std::vector<double> heavy_, gradient_, low_, high_, dq_, trial_;
     std::vector<int> sense_, nonzero_;
 };

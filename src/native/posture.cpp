@@ -401,16 +401,16 @@ void bind_posture(nb::module_& m) {
                  const double merit = s.look(p, w.posture(q), reach);
                  s.linearise(p, q.data());
                  const std::size_t nv = w.model->nv;
-                 const auto rows = [nv](const Block& b) {
-                     return own({b.J.begin(), b.J.begin() + b.n * nv},
-                                {static_cast<std::size_t>(b.n), nv});
+                 const auto stack = [nv](const std::vector<double>& J, std::size_t n) {
+                     return own({J.begin(), J.begin() + n * nv}, {n, nv});
                  };
-                 const Block& closed = s.rows.closed;
+                 const std::size_t kept = s.lower.size() - nv;
                  return nb::make_tuple(
                      own(std::vector<double>(s.H), {nv, nv}), own(std::vector<double>(s.c)),
-                     rows(closed), own({closed.lo.begin(), closed.lo.begin() + closed.n}),
-                     rows(s.rows.kept), own(std::vector<double>(s.lower)),
-                     own(std::vector<double>(s.upper)), merit);
+                     stack(s.closed_rows(), s.errors().size()),
+                     own(std::vector<double>(s.errors())), stack(s.kept_rows(), kept),
+                     own(std::vector<double>(s.lower)), own(std::vector<double>(s.upper)),
+                     merit);
              },
              "The QP at q: H, c, closed rows and errors, kept rows, bounds, merit.")
         .def("step",
