@@ -316,6 +316,7 @@ def has_fallen(
     q: np.ndarray, reference: np.ndarray, tilt: float, height: float
 ) -> bool:
     """The base has tilted [rad] or sunk [m] that far from its reference."""
+
 EDGE_INSET: float
 EDGE_ROOM: float
 EDGE_WEIGHT: float
@@ -435,12 +436,7 @@ class Workspace:
     def path(
         self,
         postures: list[np.ndarray],
-        held: np.ndarray,
-        held_values: np.ndarray,
-        rolling: np.ndarray,
-        rolling_values: np.ndarray,
-        made: np.ndarray,
-        made_values: np.ndarray,
+        contacts: list[tuple[np.ndarray, np.ndarray]],
         margin: float,
         adapt: bool,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, _Verdict]:
@@ -449,11 +445,6 @@ class Workspace:
     def check_path(
         self,
         phases: list[np.ndarray],
-        held: np.ndarray,
-        held_values: np.ndarray,
-        rolling: np.ndarray,
-        rolling_values: np.ndarray,
-        made: np.ndarray,
-        made_values: np.ndarray,
+        contacts: list[tuple[np.ndarray, np.ndarray]],
     ) -> _Verdict:
         """What is wrong with the postures of a path."""

@@ -14,6 +14,8 @@ namespace clamber {
 
 namespace {
 
+// Rows of contacts: whole numbers, and real ones.
+using Packed = std::tuple<Array2<int>, Array2<>>;
 using Matrix = nb::ndarray<nb::numpy, double, nb::c_contig, nb::device::cpu>;
 
 Matrix own(std::vector<double>&& data, std::vector<std::size_t> shape) {
@@ -260,12 +262,15 @@ struct Workspace {
         rows.told.assign(told.data(), told.data() + told.size());
     }
 
-    void read_contacts_of(Transition& t, const Array2<int>& held, const Array2<>& held_where,
-                          const Array2<int>& rolling, const Array2<>& rolling_where,
-                          const Array2<int>& made, const Array2<>& made_where) const {
-        t.held = read_contacts(*model, held, held_where);
-        t.rolling = read_contacts(*model, rolling, rolling_where);
-        const auto new_ones = read_contacts(*model, made, made_where);
+    // Contacts that stay, those that are broken, and the new one.
+    void read_contacts_of(Transition& t, const std::vector<Packed>& contacts) const {
+        check_size(contacts.size(), 3, "contacts");
+        const auto read = [this](const Packed& c) {
+            return read_contacts(*model, std::get<0>(c), std::get<1>(c));
+        };
+        t.held = read(contacts[0]);
+        t.rolling = read(contacts[1]);
+        const auto new_ones = read(contacts[2]);
         t.makes = !new_ones.empty();
         if (t.makes) t.made = new_ones[0];
     }
@@ -478,14 +483,10 @@ void bind_posture(nb::module_& m) {
              "Postures from one to another with contacts closed, near the straight way.")
         .def("path",
              [](Workspace& w, const std::vector<Array1<>>& postures,
-                const Array2<int>& held, const Array2<>& held_where,
-                const Array2<int>& rolling, const Array2<>& rolling_where,
-                const Array2<int>& made, const Array2<>& made_where, double margin,
-                bool adapt) {
+                const std::vector<Packed>& contacts, double margin, bool adapt) {
                  check_size(postures.size(), 4, "postures");
                  Transition t;
-                 w.read_contacts_of(t, held, held_where, rolling, rolling_where, made,
-                                    made_where);
+                 w.read_contacts_of(t, contacts);
                  std::vector<double>* const parts[4] = {&t.before, &t.shifted, &t.touching,
                                                         &t.after};
                  for (int k = 0; k < 4; ++k) {
@@ -509,14 +510,11 @@ void bind_posture(nb::module_& m) {
              },
              "Postures of shift, swing and settle, the arc's control points, the verdict.")
         .def("check_path",
-             [](Workspace& w, const std::vector<Array2<>>& phases, const Array2<int>& held,
-                const Array2<>& held_where, const Array2<int>& rolling,
-                const Array2<>& rolling_where, const Array2<int>& made,
-                const Array2<>& made_where) {
+             [](Workspace& w, const std::vector<Array2<>>& phases,
+                const std::vector<Packed>& contacts) {
                  check_size(phases.size(), 3, "phases");
                  Transition t;
-                 w.read_contacts_of(t, held, held_where, rolling, rolling_where, made,
-                                    made_where);
+                 w.read_contacts_of(t, contacts);
                  Path out;
                  for (int k = 0; k < 3; ++k)
                      for (std::size_t i = 0; i < phases[k].shape(0); ++i) {

@@ -76,7 +76,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     """
     t = transition
     postures = [t.before, t.shifted, t.touching, t.after]
-    *postures, control, found = ik.core.path(postures, *_packed(ik, t), t.margin, adapt)
+    *postures, control, found = ik.core.path(postures, _packed(ik, t), t.margin, adapt)
     phases = contact_phases(
         t.stance, t.held, t.rolling, t.step.makes, postures, control
     )
@@ -97,13 +97,13 @@ def check_phases(
         t: Whose contacts are looked at.
         postures: (n, nq) of shift, swing and settle.
     """
-    return _verdict(ik, t, ik.core.check_path(list(postures), *_packed(ik, t)))
+    return _verdict(ik, t, ik.core.check_path(list(postures), _packed(ik, t)))
 
 
-def _packed(ik: IK, t: Transition) -> list[np.ndarray]:
+def _packed(ik: IK, t: Transition) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Contacts that stay, those that are broken, and the new one."""
     made = () if t.step.makes is None else (t.step.makes,)
-    parts = (packed_contacts(ik.world, c) for c in (t.held, t.rolling, made))
-    return [array for pair in parts for array in pair]
+    return [packed_contacts(ik.world, c) for c in (t.held, t.rolling, made)]
 
 
 _KINDS = ("shift", "swing", "settle")
