@@ -15,7 +15,9 @@ constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 // Cores nearer than this share of their size have no direction from one to the other; on
 // curved ones GJK finds it only to the root of rounding.
 constexpr double kTouch = 1e-10, kTouchCurved = 1e-7;
-constexpr double kGap = 1e-13;  // share of the size by which a distance may be wrong
+// Shares of the size by which a distance and a depth may be wrong: faces of a polytope may
+// be slivers.
+constexpr double kGap = 1e-13, kDepthGap = 1e-10;
 constexpr double kRounding = 1e-15;  // of vertices, as a share of the size
 constexpr int kIterations = 100;
 constexpr int kVertices = 200, kFaces = 2 * kVertices;
@@ -282,10 +284,11 @@ class Polytope {
             const int f = nearest_face();
             const Vertex w = support(pair_, face_[f].n);
             const double far = dot(face_[f].n, w.w);
-            if (far < depth) depth = far, normal = face_[f].n;
-            if (far - face_[f].h <= kGap * scale_ || vertices_ == kVertices || !expand(f, w)) break;
+            const bool is_reached = far - face_[f].h <= kDepthGap * scale_;
+            if (is_reached || far < depth) depth = far, normal = face_[f].n;
+            if (is_reached || vertices_ == kVertices || !expand(f, w)) break;
         }
-        meet(nearest_face(), touching);
+        meet(depth * normal, normal, touching);
     }
 
  private:
@@ -387,42 +390,42 @@ class Polytope {
                 rim[n_rim++] = {g, e};
             }
         if (n_rim < 3 || n_rim > n_seen + 2) return false;
-        v_[vertices_] = w;
+        const auto start = [&](int i) { return face_[rim[i].face].v[(rim[i].edge + 1) % 3]; };
         int starting[kVertices];  // the new face whose edge on the rim starts at a vertex
         std::fill(starting, starting + vertices_, -1);
         for (int i = 0; i < n_rim; ++i) {
-            const auto [g, e] = rim[i];
-            const int f = i < n_seen ? seen[i] : faces_++, from = face_[g].v[(e + 1) % 3];
-            if (starting[from] >= 0) return false;
-            set_face(f, from, face_[g].v[e], vertices_);
-            face_[f].next[0] = g;
-            face_[g].next[e] = f;
-            starting[from] = f;
+            if (starting[start(i)] >= 0) return false;
+            starting[start(i)] = i < n_seen ? seen[i] : faces_ + i - n_seen;
         }
-        ++vertices_;
-        for (int i = n_rim; i < n_seen; ++i) face_[seen[i]].n = {}, face_[seen[i]].h = kInf;
+        v_[vertices_] = w;
         for (int i = 0; i < n_rim; ++i) {
-            const int f = face_[rim[i].face].next[rim[i].edge], after = starting[face_[f].v[1]];
-            if (after < 0) return false;
-            face_[f].next[1] = after;
-            face_[after].next[2] = f;
+            const auto [g, e] = rim[i];
+            const int p = start(i), q = face_[g].v[e], f = starting[p];
+            set_face(f, p, q, vertices_);
+            face_[f].next[0] = g;
+            face_[f].next[1] = starting[q];
+            face_[g].next[e] = f;
         }
+        for (int i = 0; i < n_rim; ++i) {
+            const int f = starting[start(i)];
+            face_[face_[f].next[1]].next[2] = f;
+        }
+        for (int i = n_rim; i < n_seen; ++i) face_[seen[i]].n = {}, face_[seen[i]].h = kInf;
+        faces_ += std::max(n_rim - n_seen, 0);
+        ++vertices_;
         return true;
     }
 
-    // The points of the cores that meet where the origin lies before a face; of faces in
-    // one plane, the one that it lies before.
-    void meet(int face, Simplex& s) const {
-        const Vec3 n = face_[face].n, foot = face_[face].h * n;
+    // The points of the cores that meet near a point of the surface with that normal.
+    void meet(const Vec3& point, const Vec3& normal, Simplex& s) const {
         double least = kInf;
         for (int f = 0; f < faces_; ++f) {
-            if (dot(face_[f].n, n) < 1 - 1e-12 || face_[f].h > face_[face].h + kTouch * scale_)
-                continue;
+            if (dot(face_[f].n, normal) < 0.9) continue;
             Simplex on;
             on.n = 3;
             for (int k = 0; k < 3; ++k) on.v[k] = v_[face_[f].v[k]];
-            nearest_on(on.v[0].w - foot, on.v[1].w - foot, on.v[2].w - foot, on.weight);
-            const double off = square(on.at<&Vertex::w>() - foot);
+            nearest_on(on.v[0].w - point, on.v[1].w - point, on.v[2].w - point, on.weight);
+            const double off = square(on.at<&Vertex::w>() - point);
             if (off < least) least = off, s = on;
         }
     }
