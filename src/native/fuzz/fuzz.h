@@ -90,12 +90,14 @@ struct Part {
 
 void polygon(Random& random, Outcome& outcome);
 void qp(Random& random, Outcome& outcome);
+void statics(Random& random, Outcome& outcome);
 void geometry(Random& random, Outcome& outcome);
 void proximity(Random& random, Outcome& outcome);
 
 constexpr Part PARTS[] = {
     {"polygon", polygon},
     {"qp", qp},
+    {"statics", statics},
     {"geometry", geometry},
     {"proximity", proximity},
 };
