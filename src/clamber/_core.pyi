@@ -415,6 +415,14 @@ class Workspace:
     ) -> bool:
         """Whether forces and torques that are counted on hold the robot at q."""
 
+    def centres_of_mass(self, q: np.ndarray) -> np.ndarray:
+        """(n, 3) of the robot at postures (n, nq)."""
+
+    def kinematics(
+        self, q: np.ndarray, body: int, point: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Positions, rotations; Jacobians of the centre of mass, of a body's point."""
+
     def holding_torques(
         self,
         contacts: np.ndarray,

@@ -434,6 +434,50 @@ void bind_posture(nb::module_& m) {
                  return w.planner.is_stable(contacts, w.posture(q));
              },
              "Whether forces and torques that are counted on hold the robot at q.")
+        .def("centres_of_mass",
+             [](Workspace& w, const Array2<>& q) {
+                 const std::size_t n = q.shape(0), nq = w.model->nq;
+                 if (n) check_size(q.shape(1), nq, "q");
+                 const std::lock_guard lock(w.busy);
+                 std::vector<double> out(3 * n);
+                 for (std::size_t i = 0; i < n; ++i) {
+                     w.planner.solver.kin.update(q.data() + i * nq);
+                     write3(w.planner.solver.kin.com(), out.data() + 3 * i);
+                 }
+                 return own(std::move(out), {n, 3});
+             },
+             "(n, 3) of the robot at postures (n, nq).")
+        .def("kinematics",
+             [](Workspace& w, const Array1<>& q, int body, const Array1<>& point) {
+                 check_size(point.size(), 3, "point");
+                 index(body, w.model->bodies.size(), "body");
+                 const std::lock_guard lock(w.busy);
+                 Kinematics& kin = w.planner.solver.kin;
+                 kin.update(w.posture(q));
+                 const std::size_t n = w.model->bodies.size(), nv = w.model->nv;
+                 std::vector<double> x(3 * n), R(9 * n), com(3 * nv), jac(6 * nv, 0.0);
+                 for (std::size_t b = 0; b < n; ++b) {
+                     write3(kin.pos(static_cast<int>(b)), x.data() + 3 * b);
+                     std::copy_n(kin.rotation(static_cast<int>(b)).m, 9, R.data() + 9 * b);
+                 }
+                 const Vec3* jcom = kin.com_jacobian();
+                 for (std::size_t d = 0; d < nv; ++d)
+                     for (int k = 0; k < 3; ++k) com[k * nv + d] = jcom[d][k];
+                 const Vec3 p = read3(point.data());
+                 for (const int d : w.model->chain[body]) {
+                     const Twist& t = kin.twist(d);
+                     const Vec3 moves = t.v + cross(t.w, p);
+                     for (int k = 0; k < 3; ++k) {
+                         jac[k * nv + d] = moves[k];
+                         jac[(3 + k) * nv + d] = t.w[k];
+                     }
+                 }
+                 return nb::make_tuple(own(std::move(x), {n, 3}), own(std::move(R), {n, 3, 3}),
+                                       own(std::move(com), {3, nv}),
+                                       own(std::move(jac), {6, nv}));
+             },
+             "Bodies' positions and rotations at q, the Jacobians of the centre of mass and "
+             "of a body's point.")
         .def("holding_torques",
              [](Workspace& w, const Array2<int>& what, const Array2<>& where,
                 const Array2<>& prices, const Array2<>& q) {

@@ -340,17 +340,16 @@ def _balanced_cruise(
     mass has to the border of the support polygon.
     """
     fine = np.linspace(0.0, length, BALANCE_SAMPLES)
-    com = np.empty((len(fine), 3))
-    for i, q in enumerate(_on_manifold(curve(fine), curve(fine, 1))[0]):
-        kin.update(q)
-        com[i] = kin.com
+    q = _on_manifold(curve(fine), curve(fine, 1))[0]
+    com = kin.core.centres_of_mass(q)
     path = CubicSpline(fine, com)
+    kin.update(q[-1])
     points = contact_points(kin, phase.contacts).points
     polygon = support_polygon(points[:, :2])
     low = float(points[:, 2].min())
     room = np.maximum(com_margins(com[:, :2], polygon), 0.0)
     for _ in range(MAX_SLOWINGS):
-        s, rate = _profile(length, cruise)[::BALANCE_STRIDE].T
+        s, rate = _profile(length, cruise, BALANCE_STRIDE).T
         change = np.gradient(rate, BALANCE_STRIDE / RATE)
         acceleration = path(s, 2) * rate[:, None] ** 2 + path(s, 1) * change[:, None]
         p = zero_moment_point(path(s), acceleration, low)
@@ -361,7 +360,7 @@ def _balanced_cruise(
     return cruise
 
 
-def _profile(length: float, cruise: float) -> np.ndarray:
+def _profile(length: float, cruise: float, stride: int = 1) -> np.ndarray:
     """(n, 2) s and ds/dt at 1 kHz: smooth rise to the cruise speed, smooth fall.
 
     The rise is a raised cosine, so that acceleration has no jumps.
@@ -372,7 +371,7 @@ def _profile(length: float, cruise: float) -> np.ndarray:
     total = max(length / cruise + ramp, MIN_PHASE, 2 * ramp)
     n = int(np.ceil(total * RATE))
     total = n / RATE  # a whole number of samples, else ds/dt is not the derivative
-    t = np.arange(1, n + 1) / RATE
+    t = np.arange(1, n + 1, stride) / RATE
 
     def rise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x = np.clip(x, 0.0, ramp)
