@@ -761,11 +761,11 @@ def test_verdicts_agree_with_klampt_on_a_thousand_stances(edges):
 
 
 def test_the_quick_test_fits_a_planners_inner_loop():
-    """150 us is the aim; a loaded machine gets four times that."""
+    """5 us is the aim; a loaded machine gets ten times that."""
     rng = np.random.default_rng(18)
     took = []
     for contacts, com in [random_stance(rng) for _ in range(200)]:
         start = time.perf_counter()
         is_statically_stable(contacts, com)
         took.append(time.perf_counter() - start)
-    assert np.median(took) < 600e-6
+    assert np.median(took) < 50e-6
