@@ -29,7 +29,7 @@ def shapes(rng: np.random.Generator) -> mujoco.MjModel:
     """Geoms of each kind, in order."""
     spec = mujoco.MjSpec()
     for kind in range(7):
-        for k in range(EACH if kind else 1):
+        for k in range(EACH):
             quat = rng.normal(size=4)
             g = spec.worldbody.add_geom(
                 type=SHAPES[kind],
