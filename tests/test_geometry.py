@@ -20,6 +20,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
+from humanoids import mjcf, urdf
 
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = range(7)
 NAMES = [k.name.removeprefix("mjGEOM_").lower() for k in SHAPES]
@@ -412,6 +413,27 @@ def test_all_distances_of_a_robot_are_those_of_mujoco(robot_world, rng):
             if d > -0.02:
                 theirs = mujoco.mj_geomDistance(m, kin.data, a, b, 10.0, None)
                 assert d == pytest.approx(theirs, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text", [mjcf(), mjcf(0.4), urdf()], ids=["small", "tiny", "urdf"]
+)
+def test_all_distances_of_a_description_are_those_of_mujoco(text, rng):
+    """Any two geoms, neighbours too, which overlap at their joints."""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    pairs = np.array(list(itertools.combinations(range(model.ngeom), 2)))
+    near, compared = near_pairs(model, pairs), 0
+    for _ in range(8):
+        data.qpos[:] = rng.uniform(-1.5, 1.5, model.nq)
+        mujoco.mj_kinematics(model, data)
+        distance = near.query(data.geom_xpos, data.geom_xmat, np.inf)[1]
+        for d, (a, b) in zip(distance, pairs.tolist(), strict=True):
+            if d > -0.01:
+                theirs = mujoco.mj_geomDistance(model, data, a, b, 10.0, None)
+                assert d == pytest.approx(theirs, abs=1e-6)
+                compared += 1
+    assert compared > 200
 
 
 def some_shapes(rng: np.random.Generator) -> mujoco.MjModel:
