@@ -92,6 +92,7 @@ void Solver::linearise(const Problem& problem, const double* q) {
     }
     std::copy(rows.kept.lo.begin(), rows.kept.lo.begin() + rows.kept.n, lower.begin() + nv);
     std::copy(rows.kept.hi.begin(), rows.kept.hi.begin() + rows.kept.n, upper.begin() + nv);
+    factored_ = false;
     kept_.swap(rows.kept.J);
     closed_.swap(rows.closed.J);
     errors_.assign(rows.closed.lo.begin(), rows.closed.lo.begin() + rows.closed.n);
@@ -107,6 +108,19 @@ void Solver::linearise(const Problem& problem, const double* q) {
         }
     sense_.assign(m, SOFT);
     std::fill(sense_.begin(), sense_.begin() + nv, 0);
+}
+
+QP Solver::qp() const {
+    QP out;
+    out.n = out.bounded = model.nv;
+    out.m = static_cast<int>(lower.size());
+    out.H = heavy_.data();
+    out.c = gradient_.data();
+    out.A = kept_.data();
+    out.upper = high_.data();
+    out.lower = low_.data();
+    out.sense = sense_.data();
+    return out;
 }
 
 void Solver::step(double radius, double* dq) {
@@ -130,16 +144,9 @@ void Solver::step(double radius, double* dq) {
         const double* row = closed_.data() + i * nv;
         for (int d = 0; d < nv; ++d) gradient_[d] -= row[d] * e;
     }
-    QP qp;
-    qp.n = qp.bounded = nv;
-    qp.m = m;
-    qp.H = heavy_.data();
-    qp.c = gradient_.data();
-    qp.A = kept_.data();
-    qp.upper = high_.data();
-    qp.lower = low_.data();
-    qp.sense = sense_.data();
-    qp_.solve(qp);  // where it fails, x is zero
+    // Where a step is tried again shorter, the factors are those of the longer one.
+    factored_ = factored_ && qp_.solve_again(gradient_.data()) > 0;
+    if (!factored_) factored_ = qp_.solve(qp()) > 0;  // where it fails, x is zero
     for (int d = 0; d < nv; ++d) dq[d] = std::min(std::max(qp_.x()[d], low_[d]), high_[d]);
 }
 

@@ -79,10 +79,12 @@ class Solver {
         bool converged = false;
         double merit = 0.0;
     };
+    QP qp() const;  // of a step
     Descent descend(const Problem& problem, const double* q, double merit, int iterations,
                     double tolerance, bool leap, std::vector<double>& x);
 
     QPSolver qp_;
+    bool factored_ = false;  // the QP as it was built last
     std::vector<double> largest_;  // step of each dof
     std::vector<double> kept_, closed_, errors_;  // Jacobians, and what is to be closed
     std::vector<double> heavy_, gradient_, low_, high_, dq_, trial_;
