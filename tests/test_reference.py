@@ -37,10 +37,10 @@ def test_playing_goes_to_a_sample_or_until_something_happens(ref, hands_plan):
     t, dadr = hands_plan.trajectory, hands_plan.world.dadr
     assert exhaust(ref, ref.play(700)) == 700
     assert ref.i == 700
-    assert np.array_equal(ref.track.q, t.q[700])
-    assert np.array_equal(ref.track.torque, t.tau[700])
-    assert np.array_equal(ref.track.velocity, t.v[700, dadr])
-    assert np.array_equal(ref.track.closed, t.contact[700])
+    assert np.array_equal(ref.q, t.q[700])
+    assert np.array_equal(ref.torque, t.tau[700])
+    assert np.array_equal(ref.velocity, t.v[700, dadr])
+    assert np.array_equal(ref.closed, t.contact[700])
     assert exhaust(ref, ref.play(900, until=lambda: ref.i >= 750)) == 50
     assert exhaust(ref, ref.play(740)) == 0
     assert not ref.left_plan
@@ -50,17 +50,17 @@ def test_going_back_is_the_way_in_reverse(ref, hands_plan):
     t, dadr = hands_plan.trajectory, hands_plan.world.dadr
     exhaust(ref, ref.play(900))
     assert exhaust(ref, ref.back(800)) == 100
-    assert np.array_equal(ref.track.q, t.q[800])
-    assert np.array_equal(ref.track.velocity, -t.v[800, dadr])
+    assert np.array_equal(ref.q, t.q[800])
+    assert np.array_equal(ref.velocity, -t.v[800, dadr])
     assert ref.left_plan
 
 
 def test_resting_holds_the_reference_without_velocity(ref):
     exhaust(ref, ref.play(900))
-    q = ref.track.q.copy()
+    q = ref.q.copy()
     assert exhaust(ref, ref.rest(0.25)) == 250
-    assert np.array_equal(ref.track.q, q)
-    assert not ref.track.velocity.any()
+    assert np.array_equal(ref.q, q)
+    assert not ref.velocity.any()
     assert ref.left_plan
 
 
@@ -71,11 +71,9 @@ def test_aside_goes_until_something_happens_or_there_and_back(ref, hands_plan, f
         t, **{n: getattr(t, n)[900:1000] for n in ("time", "q", "v", "tau", "contact")}
     )
     exhaust(ref, ref.play(900))
-    ticks = exhaust(
-        ref, ref.aside(way, lambda: found and ref.track.q[0] == way.q[59][0])
-    )
+    ticks = exhaust(ref, ref.aside(way, lambda: found and ref.q[0] == way.q[59][0]))
     assert ticks == (60 if found else 200)
-    assert np.array_equal(ref.track.q, way.q[59 if found else 0])
+    assert np.array_equal(ref.q, way.q[59 if found else 0])
     assert ref.i == 900  # the trajectory is where it was left
     assert ref.left_plan
 
@@ -98,10 +96,10 @@ def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
     exhaust(ref, ref.play(i))
     next(steps(ref, ref.aside(away, lambda: False)))
     ref.resume()
-    track, rows = ref.track, []
-    start = track.q.copy()
+    rows = []
+    start = ref.q.copy()
     for _ in steps(ref, ref.play(i + n + 20)):
-        rows.append((track.q.copy(), track.velocity.copy(), track.torque.copy()))
+        rows.append((ref.q.copy(), ref.velocity.copy(), ref.torque.copy()))
     q, v, tau = (np.array(x) for x in zip(*rows, strict=True))
     assert np.abs(kin.difference(start, q[0])).max() < 1e-3
     assert np.allclose(q[n + 1 :], t.q[i + n + 2 : i + n + 21], atol=1e-12)
@@ -116,9 +114,9 @@ def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
 
 def test_what_was_commanded_is_kept_where_it_is_not_the_trajectory(ref, hands_plan):
     t, world = hands_plan.trajectory, hands_plan.world
-    q = [ref.track.q.copy() for _ in steps(ref, ref.play(500))]
+    q = [ref.q.copy() for _ in steps(ref, ref.play(500))]
     assert ref.followed(np.array(q), t.keyframes) is None
-    q += [ref.track.q + 1e-3 for _ in steps(ref, ref.rest(0.1))]
+    q += [ref.q + 1e-3 for _ in steps(ref, ref.rest(0.1))]
     done = ref.followed(np.array(q), t.keyframes[:1])
     assert len(done.time) == 600
     assert np.array_equal(done.q[:500], t.q[1:501])

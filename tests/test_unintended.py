@@ -19,7 +19,7 @@ from clamber.execution.unintended import (
     loaded_link,
     nearest_of,
 )
-from clamber.execution.verdict import judge
+from clamber.execution.verdict import Figure, judge
 from clamber.model.kinematics import Kinematics
 
 
@@ -174,7 +174,7 @@ def test_a_surface_that_is_loaded_hits_no_side():
             [-40.0, 30.0, -5.0],
         ]
     )
-    assert hit_sideways(f).tolist() == [False, True, False, True, True]
+    assert hit_sideways(f) == [1, 3, 4]
 
 
 def test_what_hits_a_side_is_the_geom_nearest_to_a_support(kin):
@@ -211,7 +211,9 @@ def test_an_arm_that_leans_on_a_tile_is_lifted_off(demo_plan, seed):
     }  # fmt: skip
     rollout = simulate(demo_plan, disturbance=known[seed])
     assert any(isinstance(e, Unintended) and e.support == "box" for e in rollout.events)
-    assert judge(demo_plan, rollout).reached
+    # What it bore until it was lifted off may be more than a whole climb may have.
+    criteria = judge(demo_plan, rollout).criteria
+    assert {n for n, c in criteria.items() if not c.ok} <= {Figure.UNINTENDED}
     # What felt nothing of it would lie there for seconds.
     longest = run = 0
     for newtons in rollout.unintended > 10.0:

@@ -312,6 +312,12 @@ class Loop:
     def recorded(self) -> dict[str, np.ndarray]:
         """What was recorded, by the names of a rollout; once."""
 
+def load_is_missing(load: np.ndarray, weight: float, share: float) -> bool:
+    """Whether forces (nS, 3) are less than the weight by a share of it."""
+
+def hit_sideways(load: np.ndarray, least: float) -> list[int]:
+    """Rows of forces (nS, 3) that are sideways more than upwards and than `least`."""
+
 def has_fallen(
     q: np.ndarray, reference: np.ndarray, tilt: float, height: float
 ) -> bool:

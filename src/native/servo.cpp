@@ -69,6 +69,16 @@ bool Filter::is_pressed() const {
     return false;
 }
 
+bool load_is_missing(const double* load, int ns, double weight, double share) {
+    double sum = 0.0;
+    for (int s = 0; s < ns; ++s) sum += load[3 * s + 2];
+    return weight - sum > share * weight;
+}
+
+bool is_sideways(const double* force, double least) {
+    return std::hypot(force[0], force[1]) > std::max(least, force[2]);
+}
+
 bool Track::advance() {
     if (left() <= 0) return false;
     const int i = rows_.count == 1 ? 0 : done_;
@@ -560,9 +570,9 @@ void bind_servo(nb::module_& m) {
             auto& f = nb::cast<Follower&>(self);
             return view(f.goal.data(), {f.goal.size()}, self);
         })
-        .def_prop_ro("commanded", [](Follower& self) {
-            const size_t n = self.step_count, nq = self.track.q.size();
-            return taken(Reals(self.commanded), {n, nq});
+        .def_prop_ro("commanded", [](nb::handle_t<Follower> self) {
+            auto& f = nb::cast<Follower&>(self);
+            return view(f.commanded.data(), {size_t(f.step_count), f.track.q.size()}, self);
         });
     nb::class_<Sensors>(m, "Sensors")
         .def(nb::init<int, int, int, int, int>(), nb::kw_only(), nb::arg("nq"),
@@ -619,6 +629,15 @@ void bind_servo(nb::module_& m) {
         });
     m.attr("SCENE") = ContactForces::kScene;
     m.attr("OTHER") = ContactForces::kOther;
+    m.def("load_is_missing", [](In load, double weight, double share) {
+        return load_is_missing(load.data(), int(load.size() / 3), weight, share);
+    }, nb::arg("load"), nb::arg("weight"), nb::arg("share"));
+    m.def("hit_sideways", [](In load, double least) {
+        std::vector<int> rows;
+        for (size_t s = 0; s < load.size() / 3; ++s)
+            if (is_sideways(load.data() + 3 * s, least)) rows.push_back(int(s));
+        return rows;
+    }, nb::arg("load"), nb::arg("least"));
     m.def("has_fallen", [](In q, In reference, double tilt, double height) {
         want(q.size() >= 7 && reference.size() >= 7, "configurations");
         return has_fallen(q.data(), reference.data(), tilt, height);

@@ -69,6 +69,11 @@ private:
     double pose_share_, force_share_;
 };
 
+// Whether forces (ns, 3) of the surfaces are less than the weight, by a share of it.
+bool load_is_missing(const double* load, int ns, double weight, double share);
+// Whether a force is sideways more than upwards, and than `least` [N].
+bool is_sideways(const double* force, double least);
+
 // Rows of a reference, one for each step. Rows that are given stay where they are, in
 // memory of the caller; where there is one row for many steps, it is held.
 class Track {

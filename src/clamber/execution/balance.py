@@ -54,27 +54,34 @@ class Balance:
             period=period,
         )
         self._contacts: Sequence[Contact] = ()
+        self._acts = False
         self.goal = np.zeros(len(world.dadr))
 
     def update(
         self, q: np.ndarray, reference: np.ndarray, contacts: Sequence[Contact]
-    ) -> None:
+    ) -> bool:
         """Look at where the centre of mass is; once every period.
 
         Args:
             q: (nq,) as measured.
             reference: (nq,) as planned.
             contacts: That the plan has closed, loaded or not.
+
+        Returns:
+            Whether the goal is another one.
         """
         kin = self._kin
         if not contacts:
-            return
+            return False
         if contacts is not self._contacts:
             self._hold(contacts)
         kin.update(q)
         self._core.measured()
         kin.update(reference)
-        self.goal[:] = self._moved() if self._core.planned() else 0.0
+        acted, self._acts = self._acts, self._core.planned()
+        if acted or self._acts:
+            self.goal[:] = self._moved() if self._acts else 0.0
+        return acted or self._acts
 
     def _hold(self, contacts: Sequence[Contact]) -> None:
         """These bear from here on."""

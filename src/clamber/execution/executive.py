@@ -119,7 +119,7 @@ class OpenLoop:
     @property
     def reference(self) -> np.ndarray:
         """(nq,) of the last command."""
-        return self._ref.track.q
+        return self._ref.q
 
     @property
     def left(self) -> int:
@@ -182,19 +182,19 @@ class Executive:
         """Move the centre of mass from its reference where balance asks for it."""
         if not self._slow:  # in faster motion the robot need not balance statically
             return
-        track, closed = self._ref.track, self._ref.track.closed.tobytes()
-        if self._closed != (self._at_hand.change, closed):
-            self._closed = self._at_hand.change, closed
-            self._bearing = self._at_hand.closed_contacts(
-                track.closed, self.estimate.surfaces
-            )
-        self._balance.update(self.estimate.q, track.q, self._bearing)
-        self.core.goal[:] = self._balance.goal
+        ref, change = self._ref, self._at_hand.change
+        closed = ref.closed.tobytes()
+        if self._closed != (change, closed):
+            self._closed = change, closed
+            surfaces = self.estimate.surfaces
+            self._bearing = self._at_hand.closed_contacts(ref.closed, surfaces)
+        if self._balance.update(self.estimate.q, ref.q, self._bearing):
+            self.core.goal[:] = self._balance.goal
 
     @property
     def reference(self) -> np.ndarray:
         """(nq,) of the last command, but for what the balance adds."""
-        return self._ref.track.q
+        return self._ref.q
 
     @property
     def left(self) -> int:

@@ -27,8 +27,9 @@ class Reference:
 
     Attributes:
         trajectory: That is followed.
-        track: The rows that are being followed: `q` (nq,), `velocity` and `torque`
-            (na,) of the joints, `closed` (nS,) contacts, as of the last step.
+        track: The rows that are being followed.
+        q: (nq,); velocity: (na,) of the joints; torque: (na,) fed forward; closed:
+            (nS,) bool, contacts by surface. As of the last step, in place.
         left_plan: Something else than the first trajectory was followed.
     """
 
@@ -36,12 +37,14 @@ class Reference:
         """Begin with the first sample."""
         self._kin, self._dadr = Kinematics(world), world.dadr
         nq, surfaces = world.model.nq, len(world.surfaces)
-        self.track = _core.Track(nq, len(self._dadr), surfaces)
+        self.track = now = _core.Track(nq, len(self._dadr), surfaces)
+        self.q, self.velocity = now.q, now.velocity
+        self.torque, self.closed = now.torque, now.closed
         self._rows: list[tuple[np.ndarray, ...]] = []  # of the track, less q
         self._steps: list[int] = []  # that each of them was followed
         self.left_plan, self._way = False, 0
         self.follow(trajectory, 0)
-        self._load(trajectory, np.zeros(1, dtype=int))
+        self._load(trajectory, slice(1))
         self.track.advance()
         self._rows.clear()
 
@@ -58,7 +61,7 @@ class Reference:
     def play(self, to: int, until: Callable[[], bool] | None = None) -> Actions:
         """Follow the trajectory to sample `to`, or until something happens."""
         if self.i < to and not (until is not None and until()):
-            self._load(self.trajectory, np.arange(self.i + 1, to + 1), way=1)
+            self._load(self.trajectory, slice(self.i + 1, to + 1), way=1)
             yield
             while self.i < to and not (until is not None and until()):
                 yield
@@ -67,20 +70,18 @@ class Reference:
         """Follow the trajectory back to sample `to`."""
         self.left_plan = True
         if self.i > to:
-            rows = np.arange(to, self.i)[::-1]
-            self._load(self.trajectory, rows, way=-1, speed=-1.0)
+            self._load(self.trajectory, slice(to, self.i), way=-1, back=True)
             yield from self._done()
 
     def aside(self, t: Trajectory, until: Callable[[], bool]) -> Actions:
         """Follow another trajectory until something happens, or there and back."""
         self.left_plan = True
-        rows = np.arange(len(t.time))
-        self._load(t, rows)
+        self._load(t, slice(None))
         for _ in self._done():
             yield
             if until():
                 return
-        self._load(t, rows[::-1], speed=-1.0)
+        self._load(t, slice(None), back=True)
         yield from self._done()
 
     def rest(self, seconds: float) -> Actions:
@@ -91,17 +92,17 @@ class Reference:
     def hold(self, seconds: float) -> Actions:
         """Stand still."""
         steps, still = round(seconds / PHYSICS_STEP), np.zeros((1, len(self._dadr)))
-        now = self.track
-        q, torque, closed = (x[None].copy() for x in (now.q, now.torque, now.closed))
+        now = self.q, self.torque, self.closed
+        q, torque, closed = (x[None].copy() for x in now)
         ahead = self._ahead(np.array([self.i]))
         self._begin_rows(q, still, torque, closed, ahead, way=0, steps=steps)
         yield from self._done()
 
     def resume(self) -> None:
         """Back to the trajectory that was left, little by little while it goes on."""
-        t, i, track = self.trajectory, self.i, self.track
-        offset = self._kin.difference(t.q[i], track.q)
-        self._offset = offset, track.torque - t.tau[i], i + 1
+        t, i = self.trajectory, self.i
+        offset = self._kin.difference(t.q[i], self.q)
+        self._offset = offset, self.torque - t.tau[i], i + 1
 
     def followed(self, q: np.ndarray, keyframes: np.ndarray) -> Trajectory | None:
         """What was commanded, where that is not the first trajectory.
@@ -134,25 +135,27 @@ class Reference:
         )
 
     def _load(
-        self, t: Trajectory, rows: np.ndarray, *, way: int = 0, speed: float = 1.0
+        self, t: Trajectory, rows: slice, *, way: int = 0, back: bool = False
     ) -> None:
         """Follow samples of a trajectory from the next step on.
 
         Args:
             t: The trajectory.
-            rows: (n,) samples of it, one after the other.
+            rows: Its samples.
             way: By how much each takes the trajectory at hand on.
-            speed: Factor on velocities.
+            back: The last of them first.
         """
-        q, torque = t.q[rows], t.tau[rows]
-        velocity = speed * t.v[rows][:, self._dadr]
-        at = self.i + way * np.arange(1, len(rows) + 1)
+        parts = t.q[rows], t.v[rows][:, self._dadr], t.tau[rows], t.contact[rows]
+        if back:
+            parts = parts[0], -parts[1], *parts[2:]
+            parts = tuple(x[::-1] for x in parts)
+        q, velocity, torque, closed = map(np.ascontiguousarray, parts)
+        at = self.i + way * np.arange(1, len(q) + 1)
         if self._offset is not None and way == 1:
+            q, torque = q.copy(), torque.copy()
             self._blend(at - self._offset[2], q, velocity, torque)
-        ahead = self._ahead(at)
-        closed = t.contact[rows]
-        rest = {"way": way, "steps": len(rows)}
-        self._begin_rows(q, velocity, torque, closed, ahead, **rest)
+        rest = {"way": way, "steps": len(q)}
+        self._begin_rows(q, velocity, torque, closed, self._ahead(at), **rest)
 
     def _begin_rows(
         self,

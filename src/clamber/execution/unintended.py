@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clamber import _core
 from clamber.model.kinematics import Kinematics
 
 MISSING = 0.08  # of the weight that the surfaces do not carry
@@ -47,16 +48,15 @@ class UnintendedContact:
 
 def load_is_missing(load: np.ndarray, weight: float) -> bool:
     """Whether forces (nS, 3) of the surfaces [N] are less than the weight [N]."""
-    return weight - load[:, 2].sum() > MISSING * weight
+    return _core.load_is_missing(load, weight, MISSING)
 
 
-def hit_sideways(load: np.ndarray) -> np.ndarray:
-    """(nS,) bool: a surface is pushed sideways more than upwards, forces (nS, 3) [N].
+def hit_sideways(load: np.ndarray) -> list[int]:
+    """Which surfaces are pushed sideways more than upwards, forces (nS, 3) [N].
 
     No contact on a level support is loaded like that, at a friction of up to 1.
     """
-    sideways = np.hypot(load[:, 0], load[:, 1])
-    return sideways > np.maximum(SIDEWAYS, load[:, 2])
+    return _core.hit_sideways(load, SIDEWAYS)
 
 
 def loaded_link(
@@ -195,11 +195,11 @@ class Watch:
         self, load: np.ndarray, in_use: Callable[[], Collection[str]]
     ) -> list[str]:
         """Surfaces, none of those in use, that hit a side."""
-        rows = np.flatnonzero(hit_sideways(load))
-        if not len(rows):
+        rows = hit_sideways(load)
+        if not rows:
             return []
         used = in_use()
-        hit = [self._surfaces[int(i)] for i in rows]
+        hit = [self._surfaces[i] for i in rows]
         return [s for s in hit if s not in used]
 
     def take(self) -> UnintendedContact:

@@ -89,6 +89,8 @@ class Samples:
             if not start <= k < start + len(block):
                 start, block = self._look(np.searchsorted(self._ends, k, side="right"))
             return block[(k - start, *columns)]
+        if isinstance(rows, slice) and rows.step in (None, 1):
+            return self._stretch(*rows.indices(len(self))[:2])[(slice(None), *columns)]
         index = np.arange(len(self))[rows]
         out = np.empty((index.size, self.shape[1]))
         number = np.searchsorted(self._ends, index.ravel(), side="right")
@@ -118,6 +120,19 @@ class Samples:
         """(m, n) the rows of one block after the other."""
         for i in range(len(self._ends)):
             yield self._look(i)[1]
+
+    def _stretch(self, begin: int, end: int) -> np.ndarray:
+        """Rows `begin` to `end`, without the latter: of one block as they are."""
+        out, i = [], int(np.searchsorted(self._ends, begin, side="right"))
+        while begin < end:
+            start, block = self._look(i)
+            out.append(block[begin - start : end - start])
+            begin, i = start + len(block), i + 1
+        return (
+            out[0]
+            if len(out) == 1
+            else np.concatenate([np.zeros((0, self.shape[1])), *out])
+        )
 
     def _look(self, i: int | np.integer) -> tuple[int, np.ndarray]:
         block = self._sample(int(i))[self._which]
