@@ -49,6 +49,7 @@ def tried(monkeypatch):
         return Failure(status=Status.COLLIDING, step=step)
 
     monkeypatch.setattr(search_module, "change_contact", fail)
+    monkeypatch.setattr(search_module, "threads", lambda: 1)  # noted in order
     return moves
 
 
@@ -125,6 +126,31 @@ def test_the_same_search_finds_the_same(found, ik, goal):
     again = search(ik, goal)
     for a, b in zip(again.keyframes, found.keyframes, strict=True):
         assert np.array_equal(a.q, b.q)
+
+
+def test_what_is_found_does_not_depend_on_the_number_of_threads(ik, goal, monkeypatch):
+    """Also in which order it is noted, and why what failed did."""
+    plain, before = Search._aside, standing(ik, PlanOptions().keyframe)
+    routes, logs, aside = [], [], []
+
+    def count(self, want):
+        aside.append(want)
+        return plain(self, want)
+
+    monkeypatch.setattr(Search, "_aside", count)
+    for n in (1, 2, 4):
+        monkeypatch.setattr(search_module, "threads", lambda n=n: n)
+        shared = Search(ik, PlanOptions(), Budget(tries=40))
+        counts = {("G", "RKnee"): 5.0, ("M", "RKnee"): 5.0}  # leads astray at first
+        route = search_contacts(shared, Route(start=before), goal, counts)
+        routes.append(route)
+        logs.append([(str(a.step), str(a.failure)) for a in shared.attempts])
+        assert bool(aside) == (n > 1)
+    assert any(failure != "None" for _, failure in logs[0])
+    assert logs[0] == logs[1] == logs[2]
+    for route in routes[1:]:
+        for a, b in zip(route.keyframes, routes[0].keyframes, strict=True):
+            assert np.array_equal(a.q, b.q)
 
 
 def test_where_the_robot_is_there_already_nothing_is_planned(

@@ -368,6 +368,8 @@ def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkey
 class Named:
     """An entry that leads to others; its price may rise."""
 
+    wants = None
+
     def __init__(self, name, price, ended=False, leads_to=()):
         self.name, self.price, self.ended = name, price, ended
         self.leads_to, self.asked = leads_to, []

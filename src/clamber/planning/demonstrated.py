@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from clamber.contact.contact import Contact
 from clamber.contact.steps import Seeds, Step
 from clamber.planning.records import PlanOptions, Route
-from clamber.planning.search import Search
+from clamber.planning.search import Search, Want
 from clamber.step.change import Change, Failure
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
@@ -119,6 +119,13 @@ class _Line:
     def ended(self) -> bool:
         """Whether it has come to its last step."""
         return self.k == len(self.steps)
+
+    @property
+    def wants(self) -> Want | None:
+        """The next step."""
+        if self.ended:
+            return None
+        return self.route.end, self.steps[self.k], self.options
 
     @property
     def route(self) -> Route:

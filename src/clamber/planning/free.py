@@ -30,7 +30,7 @@ from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
 from clamber.planning.records import Route
-from clamber.planning.search import Search
+from clamber.planning.search import Search, Want
 from clamber.step.change import Failure
 from clamber.step.posture import Keyframe
 from clamber.step.stability import STANDING_SHARE, standing_share
@@ -147,6 +147,13 @@ class _Action:
     def ended(self) -> bool:
         """Whether it has arrived."""
         return self.step is None
+
+    @property
+    def wants(self) -> Want | None:
+        """The step, but where its stance has been reached meanwhile."""
+        if self.step is None or self.key in self.free.seen:
+            return None
+        return self.route.end, self.step, self.free.search.options
 
     def tried(self) -> list[_Action]:
         """What may be done after the step, where it is possible."""

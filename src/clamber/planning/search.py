@@ -4,14 +4,22 @@ What may come next is an `Entry`: how far it has come, its price, and what to tr
 more. The cheapest is taken from the queue and tried, and what it leads to is put there.
 What is tried, and with what result, is noted for all searches of a plan together, and
 one budget bounds them.
+
+Where one step has failed, what is next in the queue is tried by other threads
+meanwhile: the core leaves the interpreter alone while it solves. What is found, and in
+which order it is noted, does not depend on them.
 """
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
+import os
 import time
 from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from queue import Empty, SimpleQueue
 from typing import Protocol, Self, TypeVar
 
 from clamber.contact.steps import Step
@@ -27,9 +35,33 @@ from clamber.step.change import Change, Failure, change_contact
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
 
+# A keyframe, a step to try from it, and how.
+Want = tuple[Keyframe, Step, PlanOptions]
+
+
+def threads() -> int:
+    """How many try steps at a time: as many as there are cores.
+
+    Fewer where the environment's OMP_NUM_THREADS says so, as it does for processes
+    that work side by side.
+    """
+    cores = len(os.sched_getaffinity(0))
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(cores, int(told))) if told.isdecimal() else cores
+
+
+@functools.cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="clamber")
+
 
 class Entry(Protocol):
     """What may come next in a search."""
+
+    @property
+    def wants(self) -> Want | None:
+        """The step that is tried first, where that is known."""
+        ...
 
     @property
     def price(self) -> float:
@@ -71,6 +103,9 @@ class Search:
         self.ik, self.options, self.report = ik, options, report
         self.budget = budget or Budget()
         self.attempts: list[Attempt] = []
+        self._others = threads() - 1
+        self._ahead: dict[tuple[int, int, int], tuple[Want, Future]] = {}
+        self._spare: SimpleQueue[IK] = SimpleQueue()
         seconds = self.budget.seconds
         self._end = None if seconds is None else time.monotonic() + seconds
 
@@ -87,11 +122,36 @@ class Search:
         options: PlanOptions | None = None,
     ) -> Change | Failure:
         """Try a step that a proposer wants, and note what came of it."""
-        how = options or self.options
-        found = change_contact(self.ik, before, step, how.keyframe, how.method)
+        want = before, step, options or self.options
+        _, ahead = self._ahead.pop(_name(want), (want, None))
+        found = _tried(self.ik, want) if ahead is None else ahead.result()
         failure = found if isinstance(found, Failure) else None
         self.attempts.append(Attempt(proposer=proposer, step=step, failure=failure))
         return found
+
+    def _look_ahead(self, entries: Iterable[Entry]) -> None:
+        """Have other threads try what these want first."""
+        for entry in entries:
+            busy = sum(not f.done() for _, f in self._ahead.values())
+            want = entry.wants
+            if (
+                want is not None
+                and busy < self._others
+                and _name(want) not in self._ahead
+            ):
+                future = _pool(self._others).submit(self._aside, want)
+                self._ahead[_name(want)] = want, future
+
+    def _aside(self, want: Want) -> Change | Failure:
+        """Try a step in another workspace."""
+        try:
+            ik = self._spare.get_nowait()
+        except Empty:
+            ik = IK(self.ik.world, self.ik.extra)
+        try:
+            return _tried(ik, want)
+        finally:
+            self._spare.put(ik)
 
     def best_first(
         self, entries: Iterable[E], most: int | None = None
@@ -112,9 +172,23 @@ class Search:
             price, _, entry = heapq.heappop(queue)
             if entry.ended:
                 return entry, None
-            spent = most is not None and len(self.attempts) - before >= most
-            if spent or self.late:
+            tried = self.attempts[before:]
+            if self.late or (most is not None and len(tried) >= most):
                 return entry, Failure(status=Status.BUDGET)
+            if self._others and any(a.failure for a in tried):
+                ahead = heapq.nsmallest(self._others, queue)
+                self._look_ahead(x for _, _, x in ahead)
             for x in [entry] if entry.price > price else entry.tried():
                 heapq.heappush(queue, (x.price, next(order), x))
         return None, Failure(status=Status.EXHAUSTED)
+
+
+def _name(want: Want) -> tuple[int, int, int]:
+    """The same for the same objects, which whoever asks keeps."""
+    before, step, options = want
+    return id(before), id(step), id(options)
+
+
+def _tried(ik: IK, want: Want) -> Change | Failure:
+    before, step, options = want
+    return change_contact(ik, before, step, options.keyframe, options.method)
