@@ -1,11 +1,21 @@
-"""Time of one inverse-kinematics iteration, here and in mink and Pink.
+"""Time of one inverse-kinematics iteration, here and in placo, mink and Pink.
 
     python benchmarks/bench_ik.py
 
-COMAN stands on both feet (two 6D equality constraints) while its hands go to two points
-(two 3D tasks) and its centre of mass to the middle of its feet, close to a posture,
-within joint and step limits. From the same postures, each library takes one full step:
-kinematics, rows, QP (DAQP in all three) and integration.
+COMAN stands on both feet (two 6D constraints) while its hands go to two points (two 3D
+tasks) and its centre of mass to the middle of its feet, close to a posture, within
+joint and step limits. From the same postures, each library takes one full step, called
+from Python: kinematics, rows, QP (DAQP; in placo qpmad) and integration. With pairs, a
+row for each that is nearer than 0.10 m; mink alone takes the same pairs.
+
+"In a solve" is what planning is made of: the time of whole solves in the core by their
+iterations, trials that are taken back and the look at what was found included. Then two
+tests of a posture, from q: the margin of the centre of mass (kinematics, points that
+bear, their polygon, the distance to its border), and whether contact forces hold it.
+
+Not the same in all: here contacts weigh 1e6 in the cost, elsewhere they are equalities.
+placo needs pinocchio 3.8 and a NumPy older than the one pinned here. It is therefore no
+part of `clamber[compare]`: `pip install placo` into an environment of its own.
 """
 
 from __future__ import annotations
@@ -15,6 +25,7 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from clamber.contact.contact import Contact
 from clamber.model.robot import load_robot
@@ -27,10 +38,10 @@ from clamber.step.ik import (
     PostureProblem,
     contact_clearance,
 )
-from clamber.step.tasks import Closed, Reaching
+from clamber.step.tasks import Closed, Reaching, packed_contacts
 
 POSTURES = 300
-REPEATS = 20  # iterations from home, to see that all three solve the same problem
+REPEATS = 20  # iterations from home, to see that all solve the same problem
 HANDS = {"LHand": np.array([0.38, 0.20, 0.33]), "RHand": np.array([0.38, -0.20, 0.33])}
 FEET = ("LFoot", "RFoot")
 HAND, COM, POSTURE = 2.0, 0.3, 0.08  # weights
@@ -38,14 +49,14 @@ MARGIN = 0.01  # [m] between links, and between links and the scene
 RANGE = 0.10  # [m] nearer pairs have a row, in all that have them
 
 Step = Callable[[np.ndarray], np.ndarray]
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def feet_middle(world: World) -> np.ndarray:
     """(3,) the middle of the soles, at the height of the centre of mass at home."""
     ik = IK(world)
     ik.kin.update(world.home)
-    up = np.array([0.0, 0.0, 1.0])
-    corners = np.concatenate([ik.kin.bearing_points(f, up) for f in FEET])
+    corners = np.concatenate([ik.kin.bearing_points(f, UP) for f in FEET])
     return np.array([*corners[:, :2].mean(axis=0), ik.kin.com[2]])
 
 
@@ -56,24 +67,24 @@ def contact_at(surface: str, p: np.ndarray) -> Contact:
     )
 
 
-def clamber_step(world: World, *, collisions: bool) -> Step:
-    ik = IK(world)
+def problem_of(ik: IK, *, collisions: bool) -> PostureProblem:
+    """What all are asked for."""
+    world = ik.world
     ik.kin.update(world.home)
     tasks = []
-    up = np.array([0.0, 0.0, 1.0])
     for f in FEET:
-        p = ik.kin.contact_point(f, up)
+        p = ik.kin.contact_point(f, UP)
         tasks.append(Closed(contact=contact_at(f, p), rotation=np.eye(3)))
     for hand, p in HANDS.items():
         # A surface's goal is where it would touch: a ball's lowest point.
-        low = p - up * world.surfaces[hand].radius
+        low = p - UP * world.surfaces[hand].radius
         at = contact_at(hand, low)
         tasks.append(Reaching(contact=at, rotation=np.eye(3), weight=HAND))
     clearance = np.full(len(world.pairs), -np.inf)
     if collisions:
         where = dict.fromkeys(FEET, "ground")
         clearance = contact_clearance(world, MARGIN, where)
-    problem = PostureProblem(
+    return PostureProblem(
         tasks=tuple(tasks),
         q_reference=world.home,
         clearance=clearance,
@@ -84,10 +95,38 @@ def clamber_step(world: World, *, collisions: bool) -> Step:
         base_weight=0.0,
     )
 
+
+def clamber_step(world: World, *, collisions: bool) -> Step:
+    ik = IK(world)
+    problem = problem_of(ik, collisions=collisions)
+
     def step(q: np.ndarray) -> np.ndarray:
-        return ik.kin.integrate(q, ik.step(ik.build(problem, q)))
+        return ik.kin.integrate(q, ik.step(problem, q))
 
     return step
+
+
+def in_a_solve(world: World, inputs: list[np.ndarray], *, collisions: bool) -> float:
+    """Median time of an iteration of a whole solve [us]."""
+    ik, took = IK(world), []
+    problem = problem_of(ik, collisions=collisions)
+    for q in inputs:
+        start = time.perf_counter()
+        found = ik.solve(problem, q)
+        took.append((time.perf_counter() - start) / found.iterations)
+    return 1e6 * float(np.median(took))
+
+
+def verdicts(world: World) -> dict[str, Callable[[np.ndarray], object]]:
+    """Of a posture on both feet: margin of the centre of mass, forces."""
+    ik = IK(world)
+    problem = problem_of(ik, collisions=False)
+    feet = [t.contact for t in problem.tasks if t.contact.surface in FEET]
+    packed = packed_contacts(world, feet)
+    return {
+        "com_margin from q": lambda q: ik.residuals(problem, q).com_margin,
+        "forces hold it, from q": lambda q: ik.core.is_stable(*packed, q),
+    }
 
 
 def mink_step(world: World, *, collisions: bool) -> Step:
@@ -150,37 +189,76 @@ def mink_step(world: World, *, collisions: bool) -> Step:
     return step
 
 
-def pink_step(world: World) -> Step:
-    import pink
-    import pinocchio as pin
-    from pink.limits import ConfigurationLimit, VelocityLimit
+def between_orders(
+    world: World, order: list[int], nq: int
+) -> tuple[Step, Callable[[np.ndarray], np.ndarray]]:
+    """To pinocchio's order of q and back: quaternions xyzw, joints at `order`."""
 
-    model = pin.buildModelFromMJCF(str(world.robot.path))
-    base = slice(0, 7)
-    model.lowerPositionLimit[base], model.upperPositionLimit[base] = -np.inf, np.inf
-    speed = np.full(model.nv, STEP_ROTATION)
-    speed[:3] = STEP_TRANSLATION
-    model.velocityLimit = speed
-    for hand in HANDS:
-        s = world.surfaces[hand]
-        link = model.frames[model.getFrameId(world.model.body(s.body).name, pin.BODY)]
-        at = link.placement * pin.SE3(np.eye(3), s.centre)
-        frame = pin.Frame(hand, link.parentJoint, 0, at, pin.FrameType.OP_FRAME)
-        model.addFrame(frame)
-    order = [model.joints[model.getJointId(j)].idx_q for j in world.joints]
-
-    def to_pin(q: np.ndarray) -> np.ndarray:
-        out = pin.neutral(model)
-        out[:3], out[3:6], out[6] = q[:3], q[4:7], q[3]  # pinocchio: xyzw
+    def there(q: np.ndarray) -> np.ndarray:
+        out = np.zeros(nq)
+        out[:3], out[3:6], out[6] = q[:3], q[4:7], q[3]
         out[order] = q[world.qadr]
         return out
 
-    def from_pin(x: np.ndarray) -> np.ndarray:
+    def back(x: np.ndarray) -> np.ndarray:
         out = np.empty(len(x))
         out[:3], out[4:7], out[3] = x[:3], x[3:6], x[6]
         out[world.qadr] = x[order]
         return out
 
+    return there, back
+
+
+def urdf_of(world: World) -> str:
+    """The robot's links, hinges and hands, as pinocchio reads them."""
+    m, out = world.model, ['<robot name="robot">']
+
+    def origin(p: np.ndarray, quat: np.ndarray) -> str:
+        rpy = Rotation.from_quat(quat, scalar_first=True).as_euler("xyz")
+        return f'<origin xyz="{p[0]} {p[1]} {p[2]}" rpy="{rpy[0]} {rpy[1]} {rpy[2]}"/>'
+
+    for b in range(world.base, m.nbody):
+        body, name = m.body(b), m.body(b).name
+        x, y, z = body.inertia
+        out.append(
+            f'<link name="{name}"><inertial>{origin(body.ipos, body.iquat)}'
+            f'<mass value="{body.mass[0]}"/><inertia ixx="{x}" ixy="0" ixz="0"'
+            f' iyy="{y}" iyz="0" izz="{z}"/></inertial></link>'
+        )
+        if b == world.base:
+            continue
+        hinge = m.joint(int(body.jntadr[0]))
+        (low, high), (ax, ay, az) = hinge.range, hinge.axis
+        out.append(
+            f'<joint name="{hinge.name}" type="revolute">'
+            f'<parent link="{m.body(int(body.parentid[0])).name}"/>'
+            f'<child link="{name}"/>{origin(body.pos, body.quat)}'
+            f'<axis xyz="{ax} {ay} {az}"/><limit lower="{low}" upper="{high}"'
+            f' velocity="{STEP_ROTATION}" effort="50"/></joint>'
+        )
+    for hand in HANDS:
+        s = world.surfaces[hand]
+        out.append(
+            f'<link name="{hand}"/><joint name="to_{hand}" type="fixed">'
+            f'<parent link="{m.body(s.body).name}"/><child link="{hand}"/>'
+            f"{origin(s.centre, np.eye(4)[0])}</joint>"
+        )
+    return "".join([*out, "</robot>"])
+
+
+def pink_step(world: World) -> Step:
+    import pink
+    import pinocchio as pin
+    from pink.limits import ConfigurationLimit, VelocityLimit
+
+    model = pin.buildModelFromXML(urdf_of(world), pin.JointModelFreeFlyer())
+    base = slice(0, 7)
+    model.lowerPositionLimit[base], model.upperPositionLimit[base] = -np.inf, np.inf
+    speed = np.full(model.nv, STEP_ROTATION)
+    speed[:3] = STEP_TRANSLATION
+    model.velocityLimit = speed
+    order = [model.joints[model.getJointId(j)].idx_q for j in world.joints]
+    to_pin, from_pin = between_orders(world, order, model.nq)
     configuration = pink.Configuration(model, model.createData(), to_pin(world.home))
     feet = []
     for f in FEET:
@@ -212,6 +290,41 @@ def pink_step(world: World) -> Step:
             safety_break=False,
         )
         return from_pin(configuration.integrate(v, 1.0))
+
+    return step
+
+
+def placo_step(world: World) -> Step:
+    import placo
+
+    robot = placo.RobotWrapper("", placo.Flags.ignore_collisions, urdf_of(world))
+    order = [robot.get_joint_offset(j) for j in world.joints]
+    to_placo, from_placo = between_orders(world, order, len(robot.state.q))
+    robot.state.q = to_placo(world.home)
+    robot.update_kinematics()
+    solver = placo.KinematicsSolver(robot)
+    solver.dt = 1.0
+    solver.enable_joint_limits(True)
+    solver.enable_velocity_limits(True)
+    for f in FEET:
+        foot = solver.add_frame_task(f, robot.get_T_world_frame(f))
+        foot.configure(f, "hard", 1.0, 1.0)
+    for hand, p in HANDS.items():
+        solver.add_position_task(hand, p).configure(hand, "soft", HAND**2)
+    com = solver.add_com_task(feet_middle(world))
+    com.mask.set_axises("xy", "task")
+    com.configure("com", "soft", COM**2)
+    posture = solver.add_joints_task()
+    home = dict(zip(world.joints, world.home[world.qadr].tolist(), strict=True))
+    posture.set_joints(home)
+    posture.configure("posture", "soft", POSTURE**2)
+    solver.add_regularization_task(2e-4)
+
+    def step(q: np.ndarray) -> np.ndarray:
+        robot.state.q = to_placo(q)
+        robot.update_kinematics()
+        solver.solve(True)
+        return from_placo(robot.state.q)
 
     return step
 
@@ -258,35 +371,42 @@ def open_by(world: World, step: Step) -> tuple[float, float]:
 
 def main() -> None:
     world = build_world(load_robot("coman"), Scene.from_height(0.275))
-    inputs = postures(world, np.random.default_rng(0))
-    rows: list[tuple[str, Callable[[], Step] | None]] = [
+    inputs, pairs = postures(world, np.random.default_rng(0)), len(world.pairs)
+    rows: list[tuple[str, Callable[[], Step]]] = [
         ("clamber", lambda: clamber_step(world, collisions=False)),
+        ("placo", lambda: placo_step(world)),
         ("mink", lambda: mink_step(world, collisions=False)),
         ("Pink", lambda: pink_step(world)),
-        (
-            f"clamber, {len(world.pairs)} pairs",
-            lambda: clamber_step(world, collisions=True),
-        ),
-        (f"mink, {len(world.pairs)} pairs", lambda: mink_step(world, collisions=True)),
+        (f"clamber, {pairs} pairs", lambda: clamber_step(world, collisions=True)),
+        (f"mink, {pairs} pairs", lambda: mink_step(world, collisions=True)),
     ]
     print(f"{POSTURES} postures; after {REPEATS} iterations from home: hands, feet")
-    print(f"{'':22}{'median':>10}{'ratio':>8}{'hands':>11}{'feet':>11}")
+    print(f"{'':28}{'median':>10}{'ratio':>8}{'hands':>11}{'feet':>11}")
     ours = 0.0
     for name, make in rows:
         try:
             step = make()
         except ImportError:
-            print(f"{name:22}   not installed: pip install 'clamber[compare]'")
+            print(f"{name:28}   not installed")
             continue
         median_us(step, inputs[:20])
         us, failed = median_us(step, inputs)
         ours = us if name.startswith("clamber") else ours
         hands, feet = open_by(world, step)
         print(
-            f"{name:22}{us:7.0f} us{us / ours:7.1f}x{hands:8.2f} mm{feet:8.3f} mm",
-            end="",
+            f"{name:28}{us:7.1f} us{us / ours:7.1f}x{hands:8.2f} mm{feet:8.3f} mm"
+            f"{f'   {failed} without a step' if failed else ''}"
         )
-        print(f"   {failed} without a step" if failed else "")
+    for what, collisions in (("no pairs", False), (f"{pairs} pairs", True)):
+        us = in_a_solve(world, inputs, collisions=collisions)
+        print(f"{f'in a solve, {what}':28}{us:7.1f} us")
+    for name, job in verdicts(world).items():
+        took = []
+        for q in inputs:
+            start = time.perf_counter()
+            job(q)
+            took.append(time.perf_counter() - start)
+        print(f"{name:28}{1e6 * float(np.median(took)):7.1f} us")
 
 
 if __name__ == "__main__":
