@@ -1101,6 +1101,20 @@ def test_limits_that_are_exceeded_are_measured(plain):
     assert r.status is Status.UNREACHABLE
 
 
+@pytest.mark.parametrize("off", [0.002, 0.3])
+def test_a_joint_beyond_its_limit_is_brought_back(plain, off):
+    """Measured joints may be beyond it, where servos give way."""
+    w = plain.world
+    q = plain.solve(stance_problem(plain), w.home).q
+    bent_back = q.copy()
+    for j in (3, 9, 15, 20):
+        bent_back[w.qadr[j]] = w.q_max[w.dadr[j]] + off
+    problem = stance_problem(plain, q_reference=bent_back, posture_weight=1.0)
+    solution = plain.solve(problem, bent_back)
+    assert solution.residuals.limits == 0.0
+    assert solution.status is Status.SOLVED
+
+
 def test_a_contact_out_of_reach_is_unreachable(plain):
     far = Closed(contact=hand_on_box(1.2, 0.5), rotation=np.eye(3))
     problem = stance_problem(plain, tasks=(*stance_problem(plain).tasks[:2], far))

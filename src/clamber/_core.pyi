@@ -424,6 +424,9 @@ class Workspace:
     def centres_of_mass(self, q: np.ndarray) -> np.ndarray:
         """(n, 3) of the robot at postures (n, nq)."""
 
+    def differences(self, q: np.ndarray) -> np.ndarray:
+        """(n - 1, nv) tangent vectors from each posture (n, nq) to the next."""
+
     def kinematics(
         self, q: np.ndarray, body: int, point: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -50,6 +50,12 @@ Solver::Solver(const Model& model)
     qp_.settings.rho_soft = 1.0 / PENALTY;
 }
 
+// How far a joint is beyond its limits, negative within.
+double Solver::beyond_limits(std::size_t j, const double* q) const {
+    const double now = q[model.qadr[j]];
+    return std::max(model.q_min[j] - now, now - model.q_max[j]);
+}
+
 double Solver::look(const Problem& problem, const double* q, double reach) {
     kin.update(q);
     rows.look(kin, near, problem, reach);
@@ -60,8 +66,13 @@ double Solver::look(const Problem& problem, const double* q, double reach) {
             const double off = q[a] - problem.q_reference[a];
             posture += off * off;
         }
+    double beyond = 0.0;
+    for (std::size_t j = 0; j < model.qadr.size(); ++j) {
+        const double over = beyond_limits(j, q);
+        if (over > 0.0) beyond += over * over;
+    }
     return 0.5 * (cost + problem.posture_weight * problem.posture_weight * posture +
-                  PENALTY * rows.violation);
+                  PENALTY * (rows.violation + beyond));
 }
 
 void Solver::linearise(const Problem& problem, const double* q) {
@@ -87,8 +98,8 @@ void Solver::linearise(const Problem& problem, const double* q) {
     for (std::size_t j = 0; j < model.dadr.size(); ++j) {
         const int d = model.dadr[j];
         const double now = q[model.qadr[j]];
-        lower[d] = std::min(std::max(model.q_min[j], -FAR) - now, 0.0);
-        upper[d] = std::max(std::min(model.q_max[j], FAR) - now, 0.0);
+        lower[d] = std::max(model.q_min[j], -FAR) - now;
+        upper[d] = std::min(model.q_max[j], FAR) - now;
     }
     std::copy(rows.kept.lo.begin(), rows.kept.lo.begin() + rows.kept.n, lower.begin() + nv);
     std::copy(rows.kept.hi.begin(), rows.kept.hi.begin() + rows.kept.n, upper.begin() + nv);
@@ -251,10 +262,8 @@ Residuals Solver::residuals(const Problem& problem, const double* q) {
     out.com_margin = com_margin(kin.com().x, kin.com().y, rows.polygon);
     if (problem.balance)
         out.balance = std::max(problem.balance_margin - out.com_margin, 0.0);
-    for (std::size_t j = 0; j < model.qadr.size(); ++j) {
-        const double now = q[model.qadr[j]];
-        out.limits = std::max(out.limits, std::max(model.q_min[j] - now, now - model.q_max[j]));
-    }
+    for (std::size_t j = 0; j < model.qadr.size(); ++j)
+        out.limits = std::max(out.limits, beyond_limits(j, q));
     return out;
 }
 

@@ -79,6 +79,7 @@ class Solver {
         bool converged = false;
         double merit = 0.0;
     };
+    double beyond_limits(std::size_t joint, const double* q) const;
     QP qp() const;  // of a step
     Descent descend(const Problem& problem, const double* q, double merit, int iterations,
                     double tolerance, bool leap, std::vector<double>& x);

@@ -447,6 +447,18 @@ void bind_posture(nb::module_& m) {
                  return own(std::move(out), {n, 3});
              },
              "(n, 3) of the robot at postures (n, nq).")
+        .def("differences",
+             [](Workspace& w, const Array2<>& q) {
+                 const std::size_t n = q.shape(0), nq = w.model->nq, nv = w.model->nv;
+                 if (n) check_size(q.shape(1), nq, "q");
+                 const std::size_t steps = n ? n - 1 : 0;
+                 std::vector<double> out(steps * nv);
+                 for (std::size_t i = 0; i < steps; ++i)
+                     difference(*w.model, q.data() + i * nq, q.data() + (i + 1) * nq,
+                                out.data() + i * nv);
+                 return own(std::move(out), {steps, nv});
+             },
+             "(n - 1, nv) tangent vectors from each of the postures (n, nq) to the next.")
         .def("kinematics",
              [](Workspace& w, const Array1<>& q, int body, const Array1<>& point) {
                  check_size(point.size(), 3, "point");

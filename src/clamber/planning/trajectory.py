@@ -13,13 +13,12 @@ posture, those of leaving contacts ever dearer, and are interpolated along the s
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
+from scipy.interpolate import CubicSpline
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
@@ -274,12 +273,9 @@ def point_prices(
 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
     """(n,) path parameter: the largest joint angle travelled, base included, scaled."""
-    steps = [0.0]
-    for a, b in itertools.pairwise(nodes):
-        d = kin.difference(a, b)
-        d[:3] /= BASE_LENGTH
-        steps.append(max(float(np.abs(d).max()), 1e-6))
-    return np.cumsum(steps)
+    ways = np.abs(kin.core.differences(nodes))
+    ways[:, :3] /= BASE_LENGTH
+    return np.cumsum([0.0, *np.maximum(ways.max(axis=1), 1e-6)])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -287,9 +283,18 @@ class _Spline:
     """One phase as a function of its path parameter."""
 
     curve: CubicSpline
-    tau: BSpline
-    length: float
+    nodes: np.ndarray  # (n,) of the path parameter
+    held: np.ndarray  # (n, na) torques there
     cruise: float  # ds/dt at which the fastest joint has the speed limit
+
+    @property
+    def length(self) -> float:
+        """Path parameter at the end."""
+        return float(self.nodes[-1])
+
+    def tau(self, s: np.ndarray) -> np.ndarray:
+        """(T, na) torques, in equal steps between two nodes."""
+        return np.stack([np.interp(s, self.nodes, x) for x in self.held.T], axis=1)
 
     def sample(self, s: np.ndarray, sdot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raw, slope = self.curve(s), self.curve(s, 1)
@@ -317,16 +322,15 @@ def _spline(kin: Kinematics, phase: Phase, speed: float) -> _Spline:
             nodes[k, 3:7] *= -1
     s = _arclength(kin, nodes)
     curve = CubicSpline(s, nodes, bc_type="natural" if len(nodes) > 2 else "not-a-knot")
-    tau = make_interp_spline(s, phase_torques(kin, phase), k=1)
+    held = phase_torques(kin, phase)
     fine = np.linspace(0.0, s[-1], SAMPLES * len(nodes))
     _, slope = _on_manifold(curve(fine), curve(fine, 1))
     slope = np.abs(slope)
     slope[:, :3] /= BASE_LENGTH
     cruise = float((speed / np.maximum(slope.max(axis=0), 1e-9)).min())
-    if not np.isfinite(cruise):
-        return _Spline(curve, tau, float(s[-1]), cruise)
-    cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
-    return _Spline(curve, tau, float(s[-1]), cruise)
+    if np.isfinite(cruise):
+        cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
+    return _Spline(curve, s, held, cruise)
 
 
 def zero_moment_point(
@@ -357,12 +361,23 @@ def _balanced_cruise(
     fine = np.linspace(0.0, length, BALANCE_SAMPLES)
     q = _on_manifold(curve(fine), curve(fine, 1))[0]
     com = kin.core.centres_of_mass(q)
-    path = CubicSpline(fine, com)
     kin.update(q[-1])
     points = contact_points(kin, phase.contacts).points
     polygon = support_polygon(points[:, :2])
     low = float(points[:, 2].min())
     room = np.maximum(com_margins(com[:, :2], polygon), 0.0)
+    # Most motion is so slow that inertia could not use up its share however it went:
+    # three times what the samples say, and the steepest rise of the speed.
+    speed, bend = (np.diff(com, k, axis=0) / fine[1] ** k for k in (1, 2))
+    steepest = 0.35 * np.pi * ACCELERATION * cruise
+    most = 3.0 * float(
+        np.linalg.norm(bend, axis=1).max() * cruise**2
+        + np.linalg.norm(speed, axis=1).max() * steepest
+    )
+    high = float(com[:, 2].max()) - low
+    if high * most <= INERTIA_SHARE * float(room.min()) * (GRAVITY - most):
+        return cruise
+    path = CubicSpline(fine, com)
     for _ in range(MAX_SLOWINGS):
         s, rate = _profile(length, cruise, BALANCE_STRIDE).T
         change = np.gradient(rate, BALANCE_STRIDE / RATE)
@@ -375,16 +390,19 @@ def _balanced_cruise(
     return cruise
 
 
+def _samples(length: float, cruise: float) -> int:
+    """How many samples a `_profile` has."""
+    ramp = 1.5 / ACCELERATION
+    cruise = min(cruise, length / ramp)
+    return int(np.ceil(max(length / cruise + ramp, MIN_PHASE, 2 * ramp) * RATE))
+
+
 def _profile(length: float, cruise: float, stride: int = 1) -> np.ndarray:
     """(n, 2) s and ds/dt at 1 kHz: smooth rise to the cruise speed, smooth fall.
 
     The rise is a raised cosine, so that acceleration has no jumps.
     """
-    ramp = 1.5 / ACCELERATION
-    if length < cruise * ramp:
-        cruise = length / ramp
-    total = max(length / cruise + ramp, MIN_PHASE, 2 * ramp)
-    n = int(np.ceil(total * RATE))
+    n, ramp = _samples(length, cruise), 1.5 / ACCELERATION
     total = n / RATE  # a whole number of samples, else ds/dt is not the derivative
     t = np.arange(1, n + 1, stride) / RATE
 
@@ -440,7 +458,8 @@ def _fastest(
         prices = point_prices(kin, contacts, price_of[i, bears])
         squared = float(rate[k] ** 2)
         tau.append(least_torques(kin, demand, float(change[k]), squared, prices))
-    return s, rate, make_interp_spline(look, np.array(tau), k=1)(np.arange(len(s)))
+    between = [np.interp(np.arange(len(s)), look, x) for x in np.transpose(tau)]
+    return s, rate, np.stack(between, axis=1)
 
 
 def _bend(curve: CubicSpline, s: np.ndarray) -> np.ndarray:
@@ -608,7 +627,7 @@ def _run(
         timing, n = np.stack([s, rate]), len(s)
         rest = TOUCH_REST if made else MIN_REST
     else:
-        n, rest = len(_profile(spline.length, spline.cruise)), REST
+        n, rest = _samples(spline.length, spline.cruise), REST
     if i == len(phases) - 1:
         rest = HOLD_END
     lead = 0 if i else round(HOLD_START * RATE)
