@@ -3,14 +3,15 @@
     python benchmarks/bench_methods.py [HEIGHT]
 
 The contacts of the demonstration are detected once; then the whole climb onto a box of
-that height [m] (0.275 by default) is planned with each method: CPU time of planning
-(median of five, warm), iterations of each keyframe (of the contacts; QPs with `direct`,
-which has no outer loop), and the stability cost of its new contact, sum of
-w || X - S ||^2, at the demonstrated position and at the one found.
+that height [m] (0.275 by default) is planned with each method: CPU time of planning in
+one thread (median of five, warm), iterations of each keyframe (of the contacts; QPs
+with `direct`, which has no outer loop), and the stability cost of its new contact, sum
+of w || X - S ||^2, at the demonstrated position and at the one found.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from typing import get_args
@@ -41,6 +42,7 @@ def table(result: Plan) -> None:
 
 
 def main() -> None:
+    os.environ["OMP_NUM_THREADS"] = "1"
     height = float(sys.argv[1]) if len(sys.argv) > 1 else 0.275
     robot, scene = load_robot("coman"), Scene.from_height(height)
     sequence = detect_contacts(load_demo("climb"))
