@@ -31,11 +31,10 @@ from clamber.step.stability import (
     contact_drift,
     contact_state,
     equilibrium_at,
-    holding_limits,
     is_stable,
-    torque_limits,
+    statics_at,
 )
-from clamber.step.statics import GRAVITY, ContactPoints
+from clamber.step.statics import GRAVITY
 from clamber.step.tasks import EDGE_INSET, Closed, Sliding
 
 OUTER = {n: m for n, m in METHODS.items() if n != "direct"}
@@ -494,20 +493,20 @@ def test_holding_leaves_weak_joints_what_a_misplaced_contact_costs():
     """A quarter of the weight 16 mm off: little to a knee, much to a wrist."""
     world = build_world(load_robot("coman29"), Scene.from_height(0.275))
     kin = Kinematics(world)
-    kin.update(world.home)
-    p = kin.contact_point("LHand", UP)
-    hand = ContactPoints(
-        points=p[None], normals=UP[None], mu=np.ones(1), names=["LHand"]
+    hand = Contact(
+        surface="LHand", support="ground", position=np.zeros(3), quaternion=np.eye(4)[0]
     )
-    bears = torque_limits(kin, hand)
+    bears = statics_at(kin, world.home, (hand,))[2]
     cost = 0.25 * 0.016 * world.mass * 9.81
-    for name, limit, effort in zip(
-        world.joints, bears.limits, world.tau_max, strict=True
+    arm = [
+        n.startswith(("L", "Waist")) and not any(x in n for x in ("Hip", "Kn", "Ank"))
+        for n in world.joints
+    ]
+    for name, limit, effort, loaded in zip(
+        world.joints, bears.limits, world.tau_max, arm, strict=True
     ):
-        loaded = name.startswith(("L", "Waist")) and "Hip" not in name
-        loaded = loaded and "Kn" not in name and "Ank" not in name
         assert limit == pytest.approx(0.9 * effort - cost * loaded), name
     assert bears.limits.min() < 0.7 * 5.0
     weak = replace(world, tau_max=0.01 * world.tau_max)
-    every = np.ones(len(world.joints), bool)
-    assert np.all(holding_limits(weak, every) == 0.25 * weak.tau_max)
+    least = statics_at(Kinematics(weak), world.home, (hand,))[2].limits[arm]
+    assert np.all(least == 0.25 * weak.tau_max[arm])

@@ -25,7 +25,7 @@ from clamber.planning.trajectory import (
     build_trajectory,
     holding_torque,
 )
-from clamber.step.stability import contact_points, point_jacobians
+from clamber.step.stability import statics_at
 from clamber.step.statics import cone_generators
 
 
@@ -97,9 +97,9 @@ def holds(kin, q, force, contacts, effort: float) -> bool:
     """Whether cones and efforts can bring up a generalised force: an LP of its own."""
     w = kin.world
     kin.update(q)
-    points = contact_points(kin, contacts)
+    points, _, torque = statics_at(kin, q, contacts)
     cones = cone_generators(points.normals, points.mu, 8)
-    J = point_jacobians(kin, points).reshape(len(cones), 3, -1)
+    J = torque.jacobian.reshape(len(cones), 3, -1)
     E = np.concatenate([j.T @ g.T for j, g in zip(J, cones, strict=True)], axis=1)
     load, tau = E[w.dadr], force[w.dadr]
     limit = effort * w.tau_max

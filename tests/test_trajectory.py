@@ -24,7 +24,7 @@ from clamber.planning.trajectory import (
     zero_moment_point,
 )
 from clamber.step.polygon import com_margin, support_polygon
-from clamber.step.stability import contact_points, point_jacobians
+from clamber.step.stability import contact_points, statics_at
 from clamber.step.statics import Load, cone_generators, contact_forces
 
 
@@ -208,9 +208,9 @@ def unbalanced(kin, q, contacts, tau) -> tuple[float, float]:
     """Least |J' f + S' tau - g| over forces in the friction cones, base and joints."""
     world = kin.world
     kin.update(q)
-    points = contact_points(kin, contacts)
+    points, _, torque = statics_at(kin, q, contacts)
     cones = cone_generators(points.normals, points.mu, 16)
-    J = point_jacobians(kin, points).reshape(len(cones), 3, -1)
+    J = torque.jacobian.reshape(len(cones), 3, -1)
     columns = [j.T @ g.T for j, g in zip(J, cones, strict=True)]
     wanted = kin.gravity()
     wanted[world.dadr] -= tau

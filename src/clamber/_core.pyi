@@ -338,6 +338,7 @@ DISTANCE_TOL: float
 MARGIN_TOL: float
 CLEARANCE: float
 FURTHER_CLEARANCE: float
+EFFORT_SHARE: float
 ARC_WEIGHT: float
 DRIFT_LIMIT: float
 OVERLAP_LIMIT: float
@@ -420,6 +421,20 @@ class Workspace:
         self, contacts: np.ndarray, contact_values: np.ndarray, q: np.ndarray
     ) -> bool:
         """Whether forces and torques that are counted on hold the robot at q."""
+
+    def statics(
+        self, contacts: np.ndarray, contact_values: np.ndarray, q: np.ndarray
+    ) -> tuple[
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+        np.ndarray,
+    ]:
+        """Points that bear, normals, friction, contact of each; load and torques."""
 
     def centres_of_mass(self, q: np.ndarray) -> np.ndarray:
         """(n, 3) of the robot at postures (n, nq)."""

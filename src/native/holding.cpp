@@ -4,7 +4,6 @@ namespace clamber {
 
 namespace {
 
-constexpr double EFFORT_SHARE = 0.9;  // of the effort limits: servos need the rest
 constexpr double SPARED_ARM = 0.004;  // [m] times the weight: torque not counted on
 constexpr double LEAST_SHARE = 0.25;  // of the effort limits that is, all the same
 

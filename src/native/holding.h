@@ -17,6 +17,8 @@ struct Contact {
     Quat quaternion, link;
 };
 
+constexpr double EFFORT_SHARE = 0.9;  // of the effort limits: servos need the rest
+
 class Holding {
   public:
     explicit Holding(const Model& model);
@@ -31,18 +33,21 @@ class Holding {
     // each contact, or none.
     void torques(const double* price, double* tau);
 
-  private:
-    bool torques_with(const TorqueView& torque, const double* price, double* tau);
+    // What was looked at.
     ContactPointsView points() const;
     LoadView load() const;
     TorqueView torque() const;
+    const std::vector<int>& owners() const { return owner_; }  // contact of each point
+
+  private:
+    bool torques_with(const TorqueView& torque, const double* price, double* tau);
 
     const Model& model_;
     Statics statics_;
     Vec3 com_;
     std::vector<std::array<double, 3>> points_, normals_, forces_;
     std::vector<double> mu_, jacobian_, gravity_, limits_, price_;
-    std::vector<int> owner_;  // contact of each point
+    std::vector<int> owner_;
 };
 
 }  // namespace clamber

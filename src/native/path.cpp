@@ -294,17 +294,19 @@ double PathPlanner::drift(const double* q, const std::vector<Contact>& contacts)
     return out;
 }
 
-bool PathPlanner::is_stable(const std::vector<Contact>& contacts, const double* q) {
+Holding& PathPlanner::look(const std::vector<Contact>& contacts, const double* q) {
     solver.kin.update(q);
     holding_.look(solver.kin, contacts);
-    return holding_.residual() <= BALANCE_TOL;
+    return holding_;
+}
+
+bool PathPlanner::is_stable(const std::vector<Contact>& contacts, const double* q) {
+    return look(contacts, q).residual() <= BALANCE_TOL;
 }
 
 void PathPlanner::holding_torques(const std::vector<Contact>& contacts,
                                   const double* price, const double* q, double* tau) {
-    solver.kin.update(q);
-    holding_.look(solver.kin, contacts);
-    holding_.torques(price, tau);
+    look(contacts, q).torques(price, tau);
 }
 
 // Overlaps and contacts at all postures and half-way between, solver aside. Whether the

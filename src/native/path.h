@@ -50,6 +50,8 @@ class PathPlanner {
                 const std::vector<Contact>& contacts, Postures& out);
     // Whether contact forces and torques that are counted on hold the robot at `q`.
     bool is_stable(const std::vector<Contact>& contacts, const double* q);
+    // The same, to be asked more.
+    Holding& look(const std::vector<Contact>& contacts, const double* q);
     // (na) torques that hold it there, a force at each contact at its price.
     void holding_torques(const std::vector<Contact>& contacts, const double* price,
                          const double* q, double* tau);

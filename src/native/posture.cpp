@@ -299,6 +299,7 @@ void bind_posture(nb::module_& m) {
     m.attr("MARGIN_TOL") = MARGIN_TOL;
     m.attr("CLEARANCE") = CLEARANCE;
     m.attr("FURTHER_CLEARANCE") = FURTHER_CLEARANCE;
+    m.attr("EFFORT_SHARE") = EFFORT_SHARE;
     m.attr("ARC_WEIGHT") = ARC_WEIGHT;
     m.attr("DRIFT_LIMIT") = DRIFT_LIMIT;
     m.attr("OVERLAP_LIMIT") = OVERLAP_LIMIT;
@@ -434,6 +435,29 @@ void bind_posture(nb::module_& m) {
                  return w.planner.is_stable(contacts, w.posture(q));
              },
              "Whether forces and torques that are counted on hold the robot at q.")
+        .def("statics",
+             [](Workspace& w, const Array2<int>& what, const Array2<>& where,
+                const Array1<>& q) {
+                 const auto contacts = read_contacts(*w.model, what, where);
+                 const std::lock_guard lock(w.busy);
+                 const Holding& h = w.planner.look(contacts, w.posture(q));
+                 const ContactPointsView p = h.points();
+                 const LoadView load = h.load();
+                 const TorqueView t = h.torque();
+                 const std::size_t n = p.n, nv = t.nv, na = t.na;
+                 const auto rows = [n](const double (*x)[3]) {
+                     const auto* first = reinterpret_cast<const double*>(x);
+                     return own({first, first + 3 * n}, {n, 3});
+                 };
+                 std::vector<double> of(h.owners().begin(), h.owners().end());
+                 return nb::make_tuple(
+                     rows(p.points), rows(p.normals), own({p.mu, p.mu + n}),
+                     own(std::move(of)), own({load.com, load.com + 3}),
+                     own({t.jacobian, t.jacobian + 3 * n * nv}, {3 * n, nv}),
+                     own({t.gravity, t.gravity + nv}), own({t.limits, t.limits + na}));
+             },
+             "Points that bear at q, normals, friction, contact of each; centre of mass, "
+             "Jacobians, gravity, torques counted on.")
         .def("centres_of_mass",
              [](Workspace& w, const Array2<>& q) {
                  const std::size_t n = q.shape(0), nq = w.model->nq;

@@ -23,7 +23,7 @@ from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.step.polygon import support_polygon
-from clamber.step.stability import EFFORT_SHARE, contact_points, point_jacobians
+from clamber.step.stability import EFFORT_SHARE, statics_at
 from clamber.step.statics import cone_generators
 
 JOINT_SPEED = 4.0  # [rad/s] of a joint whose description has no lower limit
@@ -94,12 +94,12 @@ def demand_at(
         mujoco.mj_rne(m, d, 0, out)
         bias.append(out)
     d.qvel[:] = 0.0
-    points = contact_points(kin, contacts)
+    points, _, torque = statics_at(kin, q, contacts)
     return Demand(
         rest=bias[0],
         inertia=inertia,
         velocity=bent + bias[1] - bias[0],
-        jacobian=point_jacobians(kin, points),
+        jacobian=torque.jacobian,
         cones=cone_generators(points.normals, points.mu, 4),
     )
 

@@ -12,31 +12,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.statics import (
-    BALANCE_TOL,
-    GRAVITY,
     ContactPoints,
     Load,
     Phase,
     StaticEquilibrium,
     TorqueLimits,
     contact_angle,
-    contact_forces,
     contact_phase,
     projected_distance,
     static_equilibrium,
     strength_needed,
     theta_max,
 )
+from clamber.step.tasks import packed_contacts
 
-EFFORT_SHARE = 0.9  # of the effort limits, for holding: servos need the rest
-SPARED_ARM = 0.004  # [m] times the weight: torque that is not counted on for holding
-LEAST_SHARE = 0.25  # of the effort limits that is, all the same
+EFFORT_SHARE: float = _core.EFFORT_SHARE  # of the effort limits, for holding
 STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
 
 
@@ -98,26 +95,58 @@ def contact_points(kin: Kinematics, contacts: Sequence[Contact]) -> ContactPoint
     )
 
 
+def statics_at(
+    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
+) -> tuple[ContactPoints, Load, TorqueLimits]:
+    """What contacts, weight and joints are to statics at `q` (nq,).
+
+    The torques that are counted on to hold a posture are nine tenths of the effort
+    limits; of joints that a contact loads, less what one costs that lies beside where
+    it was planned: 4 mm times the weight is 16 mm for one that bears a quarter. To a
+    strong joint that is nothing, to a weak wrist much. A quarter of its limit a joint
+    always has.
+    """
+    w = kin.world
+    points, normals, mu, of, com, jacobian, gravity, limits = kin.core.statics(
+        *packed_contacts(w, contacts), q
+    )
+    return (
+        ContactPoints(
+            points=points,
+            normals=normals,
+            mu=mu,
+            names=[contacts[int(i)].surface for i in of],
+        ),
+        Load(com=com, mass=w.mass),
+        TorqueLimits(
+            jacobian=jacobian,
+            gravity=gravity,
+            dofs=w.dadr,
+            limits=limits,
+            names=w.joints,
+        ),
+    )
+
+
 def equilibrium_at(
     kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
 ) -> StaticEquilibrium:
-    """Static equilibrium with cones and `holding_limits` at `q` (nq,)."""
-    points, load, torque = _statics_at(kin, q, contacts)
+    """Static equilibrium with cones and torques that are counted on at `q` (nq,)."""
+    points, load, torque = statics_at(kin, q, contacts)
     return static_equilibrium(points, load, torque=torque)
 
 
 def is_stable(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> bool:
     """Whether forces within cones and torque limits hold the robot at `q` (nq,).
 
-    What `equilibrium_at` says without a margin, at a hundredth of the cost.
+    What `equilibrium_at` says without a margin, at a tenth of the cost.
     """
-    points, load, torque = _statics_at(kin, q, contacts)
-    return contact_forces(points, load, torque=torque).residual <= BALANCE_TOL
+    return kin.core.is_stable(*packed_contacts(kin.world, contacts), q)
 
 
 def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> str:
     """Which joint is too weak where contacts do not hold the robot at `q` (nq,)."""
-    points, load, torque = _statics_at(kin, q, contacts)
+    points, load, torque = statics_at(kin, q, contacts)
     needed = strength_needed(points, load, torque)
     if needed is None:
         return f"{Status.OVERLOADED.value}, however strong its joints"
@@ -127,53 +156,6 @@ def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
         f"{Status.OVERLOADED.value}: {torque.names[j]} would have to bear"
         f" {share * counted:.1f} N m; {counted:.1f} of its"
         f" {float(kin.world.tau_max[j]):g} are counted on"
-    )
-
-
-def _statics_at(
-    kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
-) -> tuple[ContactPoints, Load, TorqueLimits]:
-    """What statics looks at; leaves the kinematics at `q`."""
-    kin.update(q)
-    points = contact_points(kin, contacts)
-    load = Load(com=kin.com.copy(), mass=kin.world.mass)
-    return points, load, torque_limits(kin, points)
-
-
-def holding_limits(world: World, bearing: np.ndarray) -> np.ndarray:
-    """(na,) torques that are counted on to hold a posture [N m].
-
-    `EFFORT_SHARE` of the effort limits; of joints that a contact loads, less what one
-    costs that lies beside where it was planned: `SPARED_ARM` times the weight is 16 mm
-    for one that bears a quarter. To a strong joint that is nothing, to a weak wrist
-    much.
-
-    Args:
-        world: Robot and scene.
-        bearing: (na,) bool, joints that a contact loads.
-    """
-    spared = SPARED_ARM * world.mass * GRAVITY * bearing
-    least = LEAST_SHARE * world.tau_max
-    return np.maximum(EFFORT_SHARE * world.tau_max - spared, least)
-
-
-def point_jacobians(kin: Kinematics, points: ContactPoints) -> np.ndarray:
-    """(3 nc, nv) of contact points, stacked, at the present posture."""
-    J = np.empty((3 * len(points.names), kin.world.model.nv))
-    for i, (name, p) in enumerate(zip(points.names, points.points, strict=True)):
-        kin.point_jacobian(kin.world.surfaces[name].body, p, J[3 * i : 3 * i + 3])
-    return J
-
-
-def torque_limits(kin: Kinematics, points: ContactPoints) -> TorqueLimits:
-    """What the joints bear, `holding_limits`, at the present posture."""
-    w, J = kin.world, point_jacobians(kin, points)
-    return TorqueLimits(
-        jacobian=J,
-        gravity=kin.gravity(),
-        dofs=w.dadr,
-        limits=holding_limits(w, np.abs(J[:, w.dadr]).max(axis=0) > 0.0),
-        names=w.joints,
     )
 
 
