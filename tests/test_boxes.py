@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clamber import _core
 from clamber.errors import InputError
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.terrain import load_scene
 from clamber.planning.diagnose import check_scene
-from clamber.step.path import highest
 from clamber.step.statics import contact_angle
 
 
@@ -129,6 +129,10 @@ def test_check_names_what_is_wrong_with_a_support(box, word):
     faults = check_scene(Scene(boxes=(box,), start=np.zeros(3)))
     assert ("slope" in faults) == (word is not None)
     assert word is None or word in faults["slope"]
+
+
+def highest(support, p1, p2) -> float:
+    return _core.highest(support.position, support.normal, *support.edges(), p1, p2)
 
 
 def test_arcs_rise_over_the_highest_point_on_their_way():

@@ -351,6 +351,16 @@ _Residuals = tuple[float, float, float, float, int, float]
 # Status, phase, depth or opening, pair, the posture that cannot be held.
 _Verdict = tuple[int, int, float, int, np.ndarray]
 
+def highest(
+    position: np.ndarray,
+    normal: np.ndarray,
+    A: np.ndarray,
+    b: np.ndarray,
+    p1: np.ndarray,
+    p2: np.ndarray,
+) -> float:
+    """Height of a support's highest point below the way from p1 to p2 (3,)."""
+
 def arc(
     p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int
 ) -> np.ndarray:

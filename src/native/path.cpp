@@ -19,7 +19,8 @@ constexpr int MAX_REFINEMENTS = 4;       // halvings between two postures
 constexpr double ENDS = 5.0;  // a swing's first and last fifth: supports may be touched
 constexpr double COM_WEIGHT = 0.3, ELLIPSE_WEIGHT = 2.0;
 
-// Height of a support's highest point below the way from p1 to p2.
+}  // namespace
+
 double highest(const Support& s, const Vec3& p1, const Vec3& p2) {
     if (s.normal.z >= 1.0) return s.position.z;
     constexpr int n = 4 * ARC_POINTS;
@@ -33,8 +34,6 @@ double highest(const Support& s, const Vec3& p1, const Vec3& p2) {
     }
     return out > -FAR ? out : s.position.z;
 }
-
-}  // namespace
 
 SurfaceTask closed_task(const Model& model, const Contact& c) {
     SurfaceTask t;

@@ -100,6 +100,9 @@ class PathPlanner {
 
 // A task that closes a contact in its place.
 SurfaceTask closed_task(const Model& model, const Contact& c);
+// Height of a support's highest point below the way from p1 to p2; that of its origin where
+// the way passes it by, or it is level.
+double highest(const Support& support, const Vec3& p1, const Vec3& p2);
 // Control points of the arc from p1 to p2 (4.29).
 void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
          std::vector<Vec3>& out);

@@ -306,6 +306,19 @@ void bind_posture(nb::module_& m) {
     m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);
     m.attr("PATH_OVERLAPS") = static_cast<int>(Path::Status::Overlaps);
     m.attr("PATH_WEAK") = static_cast<int>(Path::Status::Weak);
+    m.def("highest",
+          [](const Array1<>& position, const Array1<>& normal, const Array2<>& A,
+             const Array1<>& b, const Array1<>& p1, const Array1<>& p2) {
+              check_size(position.size() + normal.size() + p1.size() + p2.size(), 12, "points");
+              check_size(A.size(), 3 * b.size(), "border");
+              Support s;
+              s.position = read3(position.data());
+              s.normal = read3(normal.data());
+              for (std::size_t k = 0; k < b.size(); ++k) s.A.push_back(read3(A.data() + 3 * k));
+              s.b.assign(b.data(), b.data() + b.size());
+              return highest(s, read3(p1.data()), read3(p2.data()));
+          },
+          "Height of a support's highest point below the way from p1 to p2.");
     m.def("arc",
           [](const Array1<>& p1, const Array1<>& p2, double top, bool on_top, int points) {
               check_size(p1.size() + p2.size(), 6, "ends");
