@@ -36,6 +36,7 @@ from clamber.execution.executive import (
     OpenLoop,
 )
 from clamber.execution.probe import PROBE_SPEED, REACH
+from clamber.execution.reference import STEPS
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import joint_servo, self_positioning_joints
 from clamber.execution.simulation import has_fallen, simulate
@@ -136,8 +137,9 @@ def test_undisturbed_the_plan_itself_is_followed_up_to_the_first_touch(
 ):
     """Then contacts may be waited for: what is followed is the plan, later."""
     t, followed, touch = fast_plan.trajectory, still.followed, touch_of(fast_plan, 0)
-    assert np.array_equal(followed.q[: touch - 1], t.q[1:touch])
-    assert np.array_equal(followed.tau[: touch - 1], t.tau[1:touch])
+    for name, step in ("q", STEPS["q"]), ("tau", STEPS["tau"]):
+        was, planned = getattr(followed, name), getattr(t, name)
+        assert np.abs(was[: touch - 1] - planned[1:touch]).max() <= 0.51 * step
     late = (len(followed.time) - len(t.time)) * PHYSICS_STEP
     assert 0 <= late < 6 * 0.5
     assert np.abs(followed.q[-1] - t.q[-1]).max() < 0.02
@@ -182,7 +184,8 @@ def test_the_hand_stops_where_it_touches(hands_plan, other_height):
     assert np.linalg.norm(moved) < 0.02
     # Up to there it was the plan that was followed; then it was probed for.
     t, before = hands_plan.trajectory, min(k, touch_of(hands_plan, 0))
-    assert np.array_equal(rollout.followed.q[: before - 1], t.q[1:before])
+    away = np.abs(rollout.followed.q[: before - 1] - t.q[1:before])
+    assert away.max() <= 0.51 * STEPS["q"]
 
 
 def test_what_is_left_is_done_on_the_top_as_it_is(hands_plan, other_height):
@@ -223,8 +226,8 @@ def test_what_was_followed_is_written_down_step_by_step(climbed):
     rest = push - damping * t.v[:, w.dadr] - t.tau
     ankles = np.any(list(self_positioning_joints(w).values()), axis=0)
     # What is left is the integral: bounded, and absent where joints are compliant.
-    assert np.abs(rest[:, stiff & ~ankles]).max() < 5.0 + 1e-6
-    assert np.abs(rest[:, ~stiff]).max() < 1e-6
+    assert np.abs(rest[:, stiff & ~ankles]).max() < 5.0 + 5e-3
+    assert np.abs(rest[:, ~stiff]).max() < 5e-3  # [N m], of numbers rounded
     # No jumps, also where one plan takes over from another.
     joints = t.q[:, w.qadr]
     assert np.abs(np.diff(joints, axis=0)).max() < 5e-3  # [rad] in 1 ms
@@ -293,7 +296,7 @@ def test_torques_follow_the_mass_that_is_measured(hands_plan):
     u = rollout.ctrl[k, w.model.actuator(w.joints[j]).id]
     damping = w.kd[j] + w.model.dof_damping[w.dadr[j]]
     left = w.kp[j] * (u - t.q[k, w.qadr[j]]) - damping * t.v[k, w.dadr[j]]
-    assert left == pytest.approx(event.factor * t.tau[k, j], rel=1e-6)
+    assert left == pytest.approx(event.factor * t.tau[k, j], abs=5e-3)
 
 
 def test_a_push_acts_from_when_it_begins_and_not_before(hands_plan, noisy):

@@ -75,14 +75,14 @@ def test_plain_mujoco_arrives_at_the_same_states_from_the_written_scene(
     for k, ctrl in enumerate(demo_rollout.ctrl):
         row, rest = divmod(k, demo_rollout.stride)
         if rest == 0:
-            assert np.array_equal(data.qpos, demo_rollout.qpos[row])
-            assert np.array_equal(data.qvel, demo_rollout.qvel[row])
+            assert np.array_equal(np.float32(data.qpos), demo_rollout.qpos[row])
+            assert np.array_equal(np.float32(data.qvel), demo_rollout.qvel[row])
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data)
 
 
 def test_it_starts_at_rest_where_the_plan_does(demo_plan, demo_rollout):
-    assert np.array_equal(demo_rollout.qpos[0], demo_plan.trajectory.q[0])
+    assert np.array_equal(demo_rollout.qpos[0], np.float32(demo_plan.trajectory.q[0]))
     assert not demo_rollout.qvel[0].any()
 
 

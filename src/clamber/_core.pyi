@@ -297,6 +297,7 @@ class Loop:
         forces: ContactForces,
         *,
         order: list[int],
+        step_size: float,
         base: int,
         stride: int,
         tail: int,

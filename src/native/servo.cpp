@@ -356,11 +356,11 @@ struct ListedContacts {
 // The steps of one simulation: all but `mj_step` itself, and what is recorded.
 struct Loop {
     Loop(nb::handle data, Follower& follower, Sensors& sensors, ContactForces& forces,
-         std::vector<int> order, int base, int stride, int tail, double tilt, double height,
-         std::optional<In> push)
+         std::vector<int> order, double step_size, int base, int stride, int tail, double tilt,
+         double height, std::optional<In> push)
         : follower(follower), sensors(sensors), forces(forces), listed(data),
-          order(std::move(order)), base(base), stride(stride), tail(tail), tilt(tilt),
-          height(height), push(std::move(push)) {
+          order(std::move(order)), step_size(step_size), base(base), stride(stride), tail(tail),
+          tilt(tilt), height(height), push(std::move(push)) {
         const auto numbers = [&](const char* name) {
             return nb::cast<nb::ndarray<double, nb::c_contig, nb::device::cpu>>(data.attr(name));
         };
@@ -380,7 +380,8 @@ struct Loop {
         sensors.read(qpos.data(), forces.surface.data());
         follower.step(sensors.q, sensors.force, owner);
         std::fill_n(ctrl.data(), ctrl.size(), 0.0);
-        for (size_t j = 0; j < order.size(); ++j) ctrl.data()[order[j]] = follower.command[j];
+        for (size_t j = 0; j < order.size(); ++j)
+            ctrl.data()[order[j]] = std::nearbyint(follower.command[j] / step_size) * step_size;
         append(states.ctrl, ctrl);
         if (push) {
             const bool pushes = size_t(3 * count) < push->size();
@@ -408,8 +409,7 @@ struct Loop {
             }
         }
         if (first) {
-            states.surface.insert(states.surface.end(), forces.surface.begin(),
-                                  forces.surface.end());
+            for (double f : forces.surface) states.surface.push_back(double(float(f)));
             states.other.push_back(forces.other);
             append(states.effort, effort);
             fell = has_fallen(qpos.data(), follower.track.q.data(), tilt, height);
@@ -439,8 +439,9 @@ struct Loop {
     }
 
     using Numbers = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
+    // What is recorded has single precision.
     static void append(Reals& to, const Numbers& x) {
-        to.insert(to.end(), x.data(), x.data() + x.size());
+        for (size_t i = 0; i < x.size(); ++i) to.push_back(double(float(x.data()[i])));
     }
 
     Follower& follower;
@@ -448,6 +449,7 @@ struct Loop {
     ContactForces& forces;
     ListedContacts listed;
     std::vector<int> order;
+    double step_size;  // commands are multiples of it [rad]
     int base, stride, tail;
     double tilt, height;
     std::optional<In> push;  // (n, 3) [N] on the base
@@ -599,10 +601,11 @@ void bind_servo(nb::module_& m) {
             return view(f.surface.data(), {f.surface.size() / 3, 3}, self);
         });
     nb::class_<Loop>(m, "Loop")
-        .def(nb::init<nb::handle, Follower&, Sensors&, ContactForces&, std::vector<int>, int,
-                      int, int, double, double, std::optional<In>>(),
+        .def(nb::init<nb::handle, Follower&, Sensors&, ContactForces&, std::vector<int>, double,
+                      int, int, int, double, double, std::optional<In>>(),
              nb::arg("data"), nb::arg("follower"), nb::arg("sensors"), nb::arg("forces"),
-           nb::kw_only(), nb::arg("order"), nb::arg("base"), nb::arg("stride"), nb::arg("tail"),
+           nb::kw_only(), nb::arg("order"), nb::arg("step_size"), nb::arg("base"),
+             nb::arg("stride"), nb::arg("tail"),
            nb::arg("tilt"), nb::arg("height"), nb::arg("push").none(), nb::keep_alive<1, 3>(),
            nb::keep_alive<1, 4>(), nb::keep_alive<1, 5>())
         .def("step", &Loop::step)

@@ -35,6 +35,7 @@ from clamber.cli.output import (
     MISSED,
     REACHED,
     Clock,
+    Output,
     Report,
     closing,
     conclude,
@@ -97,10 +98,9 @@ class ClimbCommand:
                     sequence, robot, scene, self.planning, folder, report, others
                 )
             done = self.execution.simulate(plan, folder, report, None)
-            missing = _draw(folder, self.video, report, (demo, sequence))
-            _save_timings(folder, clock)
-        self.output.warn(*missing)
-        return conclude(self.output, folder, plan, done, clock)
+        return _finish(
+            self.output, folder, plan, done, clock, self.video, (demo, sequence)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,10 +335,7 @@ class TraverseCommand:
             done = None
             if plan.complete:
                 done = self.execution.simulate(plan, folder, report, None)
-            missing = _draw(folder, self.video, report)
-            _save_timings(folder, clock)
-        self.output.warn(*missing)
-        return conclude(self.output, folder, plan, done, clock)
+        return _finish(self.output, folder, plan, done, clock, self.video)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -470,20 +467,29 @@ def _plan(
     return result
 
 
-def _draw(
+def _finish(
+    output: Output,
     folder: Path,
+    plan: clamber.Plan,
+    done: tuple[clamber.Rollout, clamber.Verdict] | None,
+    clock: Clock,
     video: bool,
-    report: Report,
     demonstration: tuple[clamber.Demonstration, clamber.ContactSequence] | None = None,
-) -> list[str]:
-    """Draw a run; what could not be drawn: the robot has made it all the same."""
-    try:
-        clamber.render_run(
-            folder, with_video=video, demonstration=demonstration, report=report
-        )
-    except ClamberError as e:
-        return [str(e)]
-    return []
+) -> int:
+    """The verdict, and then pictures, which nobody need wait for; the exit code."""
+    code = conclude(output, folder, plan, done, clock)
+    missing = []
+    with output.progress() as show:
+        report = clock.watching(show)
+        try:
+            clamber.render_run(
+                folder, with_video=video, demonstration=demonstration, report=report
+            )
+        except ClamberError as e:  # the robot has made it all the same
+            missing.append(str(e))
+        _save_timings(folder, clock)
+    output.warn(*missing)
+    return code
 
 
 def _save_timings(folder: Path, clock: Clock) -> None:

@@ -79,6 +79,7 @@ class Output:
                 console.print(table)
             if note:
                 console.print(note, soft_wrap=not seen)  # a log has no width
+        sys.stdout.flush()
 
 
 @contextlib.contextmanager

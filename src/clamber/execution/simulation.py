@@ -18,6 +18,7 @@ from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Event, Stopped
 from clamber.execution.executive import Executive, OpenLoop
 from clamber.execution.perturbed import perturbed_world, push_of
+from clamber.execution.reference import STEPS
 from clamber.execution.sensors import BLOCK, Sensors
 from clamber.execution.servo import ControlMode, driven_world
 from clamber.model.records import short_repr
@@ -37,6 +38,7 @@ DEFAULT_CONTROLLER: ControlMode = "mixed"
 class Rollout:
     """What physics did, as measured.
 
+    Commands are multiples of a microradian; states and forces have single precision.
     Contacts of the robot with the scene are listed after steps 0, stride, 2 stride ...
     and after every step of the last second, in the order of time.
 
@@ -129,13 +131,15 @@ def simulate(
     report = progress or (lambda stage, share, note: None)
     model = world.model
     data = mujoco.MjData(model)
-    data.qpos[:] = world.home if plan.state is None else plan.state.q
+    start = world.home if plan.state is None else plan.state.q
+    data.qpos[:] = start.astype(np.float32)  # as it is written down
     loop = _core.Loop(
         data,
         follower.core,
         sensors.core,
         sensors.forces,
         order=[model.actuator(j).id for j in world.joints],
+        step_size=STEPS["q"],
         base=world.base,
         stride=STRIDE,
         tail=round(END / PHYSICS_STEP),

@@ -30,7 +30,6 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 from clamber.errors import InputError, unreadable
-from clamber.planning.trajectory import Samples
 
 VERSION = 2
 _PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
@@ -432,20 +431,32 @@ def read_json(path: Path, *, maker: str, versions: Collection[int] = (VERSION,))
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """As `np.savez_compressed` does; what is sampled, block after block."""
+    """As `np.savez_compressed` does, only quickly.
+
+    Tables that single precision holds to the last bit are written so, column after
+    column: what changes slowly is small then.
+    """
     with (
         whole_file(path) as draft,
-        zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED) as archive,
+        zipfile.ZipFile(draft, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
     ):
         for name, x in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                if not isinstance(x, Samples):
-                    np.lib.format.write_array(file, np.asarray(x), allow_pickle=False)
-                    continue
-                about = {"descr": "<f8", "fortran_order": False, "shape": x.shape}
-                np.lib.format.write_array_header_1_0(file, about)
-                for block in x.blocks():
-                    file.write(block.astype("<f8").tobytes())
+                np.lib.format.write_array(file, _single(x), allow_pickle=False)
+
+
+def _single(x: Any) -> np.ndarray:
+    """A table (n, ...) in single precision, where that loses nothing."""
+    x = np.asarray(x)
+    if x.dtype != np.float64 or x.ndim < 2:
+        return x
+    less = np.asfortranarray(x, dtype="<f4")
+    return less if np.array_equal(less, x) else x
+
+
+def _double(x: np.ndarray) -> np.ndarray:
+    """Of single precision in double, row after row."""
+    return x.astype(float, order="C") if x.dtype == np.float32 else x
 
 
 def read_npz(path: Path, *, maker: str) -> dict[str, np.ndarray]:
@@ -456,7 +467,7 @@ def read_npz(path: Path, *, maker: str) -> dict[str, np.ndarray]:
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as f:
-            return {k: f[k] for k in f.files}
+            return {k: _double(f[k]) for k in f.files}
     except _BROKEN as e:
         reason = e.strerror if isinstance(e, OSError) and e.strerror else e
         if "pickle" in str(e):  # what numpy takes any other content for

@@ -14,6 +14,7 @@ import filecmp
 import hashlib
 import importlib.metadata
 import json
+import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
@@ -192,7 +193,7 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
         _save_world(plan.world, folder / name)
     if plan.trajectory is not None:
         save_trajectory(plan.trajectory, folder / PLANNED_TRAJECTORY)
-        _copy(folder / PLANNED_TRAJECTORY, folder / TRAJECTORY)
+        _same(folder / PLANNED_TRAJECTORY, folder / TRAJECTORY)
     save_timings(folder, plan.timings)
     write_json(folder / PLAN, _plan_fields(plan, folder))
 
@@ -356,9 +357,16 @@ def _load_timings(folder: Path) -> dict[str, float]:
     return CODEC.decode(dict[str, float], _read(folder / TIMINGS).key("seconds"))
 
 
-def _copy(source: Path, target: Path) -> None:
+def _same(source: Path, target: Path) -> None:
+    """Have the content of a file under another name too, once on the disk if it can."""
+    if target.exists() and source.samefile(target):
+        return
     with whole_file(target) as draft:
-        shutil.copyfile(source, draft)
+        draft.unlink(missing_ok=True)
+        try:
+            os.link(source, draft)
+        except OSError:  # no such file system
+            shutil.copyfile(source, draft)
 
 
 # Worlds and robots.
@@ -457,7 +465,7 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     _save_world(rollout.world, folder / SCENE)
     planned = folder / PLANNED_TRAJECTORY
     if rollout.followed is None and planned.exists():
-        _copy(planned, folder / TRAJECTORY)
+        _same(planned, folder / TRAJECTORY)
     else:
         followed = rollout.followed or trajectory_of(plan, folder)
         save_trajectory(followed, folder / TRAJECTORY)
