@@ -102,7 +102,7 @@ def read_run(run: Path) -> dict[str, Any]:
     ):
         if file.exists():
             with np.load(file) as z:
-                out[name] = digest(*(z[n] for n in ("time", "qpos", "qvel", "contact")))
+                out[name] = digest(*(z[n] for n in sorted(z.files)))
                 out[f"{name} [s]"] = float(z["time"][-1])
     if (run / "rollout.npz").exists():
         with np.load(run / "rollout.npz") as z:

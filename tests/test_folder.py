@@ -20,12 +20,14 @@ from clamber.contact.contact import ContactSequence
 from clamber.contact.steps import Skipped
 from clamber.errors import InputError, Status
 from clamber.execution.disturbance import Disturbance
+from clamber.execution.reference import STEPS, in_steps
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
 from clamber.model.robot import ROBOTS
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.planning.records import Plan
+from clamber.planning.trajectory import Samples, timed
 from clamber.run.folder import (
     EXECUTION,
     PLAN,
@@ -46,6 +48,7 @@ from clamber.run.folder import (
     save_rollout,
     save_sequence,
     save_timings,
+    save_trajectory,
     save_verdict,
 )
 from clamber.step.change import Failure
@@ -272,8 +275,43 @@ def test_plain_mujoco_loads_the_scene_and_the_trajectory_fits(plan: Plan, saved:
         assert len(joints) == model.nu
     assert model.geom("box").size[2] == pytest.approx(0.25 / 2)
     assert model.geom("ground").type == mujoco.mjtGeom.mjGEOM_PLANE
-    for a, b in (("scene.xml", "planned.xml"), ("trajectory.npz", "planned.npz")):
-        assert (saved / a).read_bytes() == (saved / b).read_bytes()
+    assert (saved / "scene.xml").read_bytes() == (saved / "planned.xml").read_bytes()
+    ran, t = load_trajectory(saved / "trajectory.npz", plan.world), plan.trajectory
+    for name in ("q", "v", "tau"):
+        off = np.abs(getattr(ran, name) - np.asarray(getattr(t, name))).max()
+        assert off <= 0.51 * STEPS[name]
+    assert np.array_equal(ran.contact, t.contact)
+
+
+def test_a_plan_takes_no_more_than_what_gives_its_samples(plan: Plan, copied: Path):
+    """A tenth of them; samples that nothing gives are all written."""
+    path, t = copied / PLANNED_TRAJECTORY, plan.trajectory
+    assert path.stat().st_size < 0.02 * np.asarray(t.q).nbytes
+    for name in ("q", "v", "tau"):
+        changed = replace(t, **{name: np.array(getattr(t, name)) + 0.1})
+        save_trajectory(changed, path)
+        assert same(load_trajectory(path, plan.world), changed)
+
+
+@pytest.mark.parametrize("speed", [0.5, "max"])
+def test_runs_of_any_speed_survive_the_disk(plan: Plan, tmp_path: Path, speed):
+    t = timed(plan.world, plan.changes, speed)
+    save_trajectory(t, tmp_path / "t.npz")
+    back = load_trajectory(tmp_path / "t.npz", plan.world)
+    assert isinstance(back.q, Samples)
+    assert same(back, t)
+
+
+@pytest.mark.parametrize("name", ["run_sizes", "node_s", "node_qpos", "run_cruise"])
+def test_runs_that_do_not_fit_together_are_named(plan: Plan, copied: Path, name: str):
+    path = copied / PLANNED_TRAJECTORY
+    with np.load(path) as f:
+        arrays = dict(f)
+    for change in ({name: arrays[name][1:]}, {name: np.array("x")}):
+        np.savez(path, **{**arrays, **change})
+        with pytest.raises(InputError) as e:
+            load_plan(copied)
+        assert e.value.source == path
 
 
 def test_the_plan_names_what_it_was_made_of(plan: Plan, saved: Path):
@@ -500,7 +538,8 @@ def test_a_broken_rollout_is_named(plan: Plan, rollout: Rollout, copied: Path):
     assert fault() == (copied / ROLLOUT, None)
     save_rollout(plan, replace(rollout, qpos=rollout.qpos[1:]), copied)
     assert fault() == (copied / ROLLOUT, "qpos")
-    save_rollout(plan, rollout, copied)
+    other = replace(rollout, followed=in_steps(plan.trajectory))
+    save_rollout(plan, other, copied)
     (copied / TRAJECTORY).unlink()
     assert fault() == (copied / TRAJECTORY, None)
     (copied / EXECUTION).write_text('{"version": 2}')

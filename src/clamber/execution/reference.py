@@ -128,21 +128,17 @@ class Reference:
         velocity, tau, contact = (np.concatenate(x) for x in zip(*rows, strict=True))
         v = np.zeros((len(q), self._kin.world.model.nv))
         v[:, self._dadr] = velocity
-        return replace(
-            self.trajectory,
-            time=np.arange(len(q)) * PHYSICS_STEP,
-            q=np.hstack(
-                [
-                    _in_steps(q[:, :3], "q"),
-                    _in_steps(q[:, 3:7], "quaternion"),
-                    _in_steps(q[:, 7:], "q"),
-                ]
-            ),
-            v=_in_steps(v, "v"),
-            tau=_in_steps(tau, "tau"),
-            contact=contact,
-            keyframes=keyframes,
-            segments=(),
+        return in_steps(
+            replace(
+                self.trajectory,
+                time=np.arange(len(q)) * PHYSICS_STEP,
+                q=q,
+                v=v,
+                tau=tau,
+                contact=contact,
+                keyframes=keyframes,
+                segments=(),
+            )
         )
 
     def _load(
@@ -211,5 +207,11 @@ class Reference:
         velocity[: len(k)] += rate[:, None] * offset[self._dadr]
 
 
-def _in_steps(x: np.ndarray, kind: str) -> np.ndarray:
-    return np.rint(x / STEPS[kind]) * STEPS[kind]
+def in_steps(t: Trajectory) -> Trajectory:
+    """The trajectory, sampled, in multiples of `STEPS`."""
+    unit = np.full(np.shape(t.q)[1], STEPS["q"])
+    unit[3:7] = STEPS["quaternion"]
+    pairs = {"q": (t.q, unit), "v": (t.v, STEPS["v"]), "tau": (t.tau, STEPS["tau"])}
+    return replace(
+        t, **{n: np.rint(np.asarray(x) / d) * d for n, (x, d) in pairs.items()}
+    )

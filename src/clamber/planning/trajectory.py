@@ -13,8 +13,8 @@ posture, those of leaving contacts ever dearer, and are interpolated along the s
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -61,7 +61,14 @@ class Samples:
     array: a reference of 1000 samples a second takes no memory.
     """
 
-    def __init__(self, sample: Sampling, which: int, ends: np.ndarray, n: int) -> None:
+    def __init__(
+        self,
+        sample: Sampling,
+        which: int,
+        ends: np.ndarray,
+        n: int,
+        runs: tuple[Run, ...] = (),
+    ) -> None:
         """Rows of one of the arrays (m, n) that `sample` gives for each block.
 
         Args:
@@ -69,7 +76,9 @@ class Samples:
             which: Of its arrays.
             ends: (B,) the row at which each block ends.
             n: Columns.
+            runs: That are sampled.
         """
+        self.runs = runs
         self.shape = int(ends[-1]), n
         self._sample, self._which, self._ends = sample, which, ends
         # From which row on, and the rows: one value, for who reads in several threads.
@@ -283,6 +292,7 @@ class _Spline:
     """One phase as a function of its path parameter."""
 
     curve: CubicSpline
+    postures: np.ndarray  # (n, nq) that it goes through
     nodes: np.ndarray  # (n,) of the path parameter
     held: np.ndarray  # (n, na) torques there
     cruise: float  # ds/dt at which the fastest joint has the speed limit
@@ -315,14 +325,21 @@ def _on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.nda
     return q, np.concatenate([slope[:, :3], omega, slope[:, 7:]], axis=1)
 
 
+def _through(
+    s: np.ndarray, postures: np.ndarray, held: np.ndarray, cruise: float
+) -> _Spline:
+    ends = "natural" if len(s) > 2 else "not-a-knot"
+    return _Spline(CubicSpline(s, postures, bc_type=ends), postures, s, held, cruise)
+
+
 def _spline(kin: Kinematics, phase: Phase, speed: float) -> _Spline:
     nodes = phase.q.copy()
     for k in range(1, len(nodes)):
         if nodes[k, 3:7] @ nodes[k - 1, 3:7] < 0:
             nodes[k, 3:7] *= -1
     s = _arclength(kin, nodes)
-    curve = CubicSpline(s, nodes, bc_type="natural" if len(nodes) > 2 else "not-a-knot")
-    held = phase_torques(kin, phase)
+    spline = _through(s, nodes, phase_torques(kin, phase), np.inf)
+    curve = spline.curve
     fine = np.linspace(0.0, s[-1], SAMPLES * len(nodes))
     _, slope = _on_manifold(curve(fine), curve(fine, 1))
     slope = np.abs(slope)
@@ -330,7 +347,7 @@ def _spline(kin: Kinematics, phase: Phase, speed: float) -> _Spline:
     cruise = float((speed / np.maximum(slope.max(axis=0), 1e-9)).min())
     if np.isfinite(cruise):
         cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
-    return _Spline(curve, s, held, cruise)
+    return replace(spline, cruise=cruise)
 
 
 def zero_moment_point(
@@ -494,28 +511,39 @@ def build_trajectory(
     kin = Kinematics(world)
     surfaces = tuple(world.surfaces)
     runs = [_run(kin, phases, i, speed) for i in range(len(phases))]
-    lengths = [x.lead + x.n + x.rest for x in runs]
+    lengths = [x.samples for x in runs]
     stops, n = np.cumsum(lengths), sum(lengths)
     closed = [{c.surface for c in phase.contacts} for phase in phases]
     flags = np.array([[s in c for s in surfaces] for c in closed])
     ends = [0, *(stops - 1).tolist()]
-
-    @functools.lru_cache(maxsize=1)
-    def moving(i: int) -> tuple[np.ndarray, np.ndarray]:
-        return runs[i].motion()
-
-    model = world.model
     return Trajectory(
         time=np.arange(n) / RATE,
-        q=Samples(moving, 0, stops, model.nq),
-        v=Samples(moving, 1, stops, model.nv),
-        tau=Samples(lambda i: (runs[i].torques(),), 0, stops, len(world.joints)),
+        **sampled(runs),
         contact=np.repeat(flags, lengths, axis=0),
         surfaces=surfaces,
         joints=world.joints,
         keyframes=np.array([ends[i] for i in keyframe_after]) / RATE,
         segments=_segments(phases, stops.tolist(), keyframe_after),
     )
+
+
+def sampled(runs: Sequence[Run]) -> dict[str, Samples]:
+    """`q`, `v` and `tau` of a trajectory, which are sampled when they are asked for."""
+    runs, stops = tuple(runs), np.cumsum([x.samples for x in runs])
+
+    @functools.lru_cache(maxsize=1)
+    def moving(i: int) -> tuple[np.ndarray, np.ndarray]:
+        return runs[i].motion()
+
+    def pushing(i: int) -> tuple[np.ndarray]:
+        return (runs[i].torques(),)
+
+    postures, torques = runs[0].spline.postures, runs[0].spline.held
+    return {
+        "q": Samples(moving, 0, stops, postures.shape[1], runs),
+        "v": Samples(moving, 1, stops, postures.shape[1] - 1, runs),
+        "tau": Samples(pushing, 0, stops, torques.shape[1], runs),
+    }
 
 
 def timed(
@@ -565,7 +593,7 @@ def _segments(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Run:
+class Run:
     """One phase in time, with samples of rest before and after it.
 
     How far along the path it is and how fast, (2, n), and the torques (n, na) are kept
@@ -578,6 +606,11 @@ class _Run:
     tau: np.ndarray | None
     lead: int
     rest: int
+
+    @property
+    def samples(self) -> int:
+        """How many, rest included."""
+        return self.lead + self.n + self.rest
 
     def motion(self) -> tuple[np.ndarray, np.ndarray]:
         """Configurations and velocities, rest included."""
@@ -612,7 +645,7 @@ def _run(
     phases: Sequence[Phase],
     i: int,
     speed: float | Literal["max"],
-) -> _Run:
+) -> Run:
     phase = phases[i]
     if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
         raise ValueError(
@@ -631,4 +664,58 @@ def _run(
     if i == len(phases) - 1:
         rest = HOLD_END
     lead = 0 if i else round(HOLD_START * RATE)
-    return _Run(spline, n, timing, torque, lead, round(rest * RATE))
+    return Run(spline, n, timing, torque, lead, round(rest * RATE))
+
+
+def runs_as_arrays(trajectory: Trajectory) -> dict[str, np.ndarray] | None:
+    """What a planned trajectory is sampled from; None where it is not.
+
+    Of R runs: `run_sizes` (R, 4) of each its nodes, the samples of its own timing, and
+    those of rest before and after it; `run_cruise` (R,) ds/dt at the largest speed. Of
+    all their N nodes: `node_s` (N,), `node_qpos` (N, nq), `node_tau` (N, na). Of the M
+    samples of their own timing: `timed_s` (M, 2) s and ds/dt, `timed_tau` (M, na).
+    """
+    runs = getattr(trajectory.q, "runs", ())
+    for x in (trajectory.v, trajectory.tau):
+        if not runs or getattr(x, "runs", ()) is not runs:
+            return None
+    splines, na = [x.spline for x in runs], runs[0].spline.held.shape[1]
+    timing, tau = [np.zeros((0, 2))], [np.zeros((0, na))]
+    for x in runs:
+        if x.timing is not None and x.tau is not None:
+            timing.append(x.timing.T)
+            tau.append(x.tau)
+    sizes = [
+        (len(x.spline.nodes), x.n if x.timing is not None else 0, x.lead, x.rest)
+        for x in runs
+    ]
+    return {
+        "run_sizes": np.array(sizes),
+        "run_cruise": np.array([x.cruise for x in splines]),
+        "node_s": np.concatenate([x.nodes for x in splines]),
+        "node_qpos": np.concatenate([x.postures for x in splines]),
+        "node_tau": np.concatenate([x.held for x in splines]),
+        "timed_s": np.concatenate(timing),
+        "timed_tau": np.concatenate(tau),
+    }
+
+
+def runs_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[Run, ...]:
+    """The runs that `runs_as_arrays` took apart."""
+    sizes, out, node, row = arrays["run_sizes"].astype(int), [], 0, 0
+    for (nodes, samples, lead, rest), cruise in zip(
+        sizes.tolist(), arrays["run_cruise"].tolist(), strict=True
+    ):
+        mine = slice(node, node + nodes)
+        s, q, torques = arrays["node_s"], arrays["node_qpos"], arrays["node_tau"]
+        spline = _through(s[mine], q[mine], torques[mine], cruise)
+        timing = tau = None
+        n = samples
+        if samples:
+            timing = np.ascontiguousarray(arrays["timed_s"][row : row + samples].T)
+            tau = arrays["timed_tau"][row : row + samples]
+        else:
+            n = len(_profile(spline.length, cruise))
+        out.append(Run(spline, n, timing, tau, lead, rest))
+        node, row = node + nodes, row + samples
+    return tuple(out)

@@ -10,12 +10,9 @@ is in the files, `codec` says how records are written.
 from __future__ import annotations
 
 import contextlib
-import filecmp
 import hashlib
 import importlib.metadata
 import json
-import os
-import shutil
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -28,6 +25,7 @@ import numpy as np
 from clamber.contact.contact import ContactSequence
 from clamber.contact.policy import GeneralPolicy
 from clamber.errors import InputError, unreadable
+from clamber.execution.reference import in_steps
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
 from clamber.model.kinematics import Kinematics
@@ -38,7 +36,12 @@ from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
 from clamber.planning.planner import Replanned
 from clamber.planning.records import Fallback, Plan
-from clamber.planning.trajectory import Trajectory
+from clamber.planning.trajectory import (
+    Trajectory,
+    runs_as_arrays,
+    runs_of_arrays,
+    sampled,
+)
 from clamber.run.codec import (
     VERSION,
     At,
@@ -74,6 +77,7 @@ _MAKERS = {SEQUENCE: "contacts", POLICY: "learn"} | dict.fromkeys(_OF_A_PLAN, "p
 _MAKERS |= dict.fromkeys(_OF_A_RUN, "simulate")
 VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
 _NOT_IN_PLAN = ("world", "trajectory", "timings", "start", "changes")
+_OF_RUNS = ("q", "v", "tau")  # what is sampled of a planned trajectory
 _IN_EXECUTION = ("events", "fell", "rests_on")
 _NOT_IN_ROLLOUT = ("world", "followed", *_IN_EXECUTION)
 _NOT_IN_EXECUTION = tuple(
@@ -193,7 +197,7 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
         _save_world(plan.world, folder / name)
     if plan.trajectory is not None:
         save_trajectory(plan.trajectory, folder / PLANNED_TRAJECTORY)
-        _same(folder / PLANNED_TRAJECTORY, folder / TRAJECTORY)
+        save_trajectory(in_steps(plan.trajectory), folder / TRAJECTORY)
     save_timings(folder, plan.timings)
     write_json(folder / PLAN, _plan_fields(plan, folder))
 
@@ -315,8 +319,10 @@ def trajectory_of(plan: Plan, source: Path) -> Trajectory:
 
 
 def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
-    """Write a trajectory."""
-    write_npz(Path(path), CODEC.arrays(trajectory))
+    """Write a trajectory: all samples, or where it is planned what gives them."""
+    runs = runs_as_arrays(trajectory)
+    without = () if runs is None else _OF_RUNS
+    write_npz(Path(path), CODEC.arrays(trajectory, without) | (runs or {}))
 
 
 def load_trajectory(path: str | Path, world: World) -> Trajectory:
@@ -333,10 +339,33 @@ def load_trajectory(path: str | Path, world: World) -> Trajectory:
         **{"joint_names": (na,), "surfaces": (ns,)},
     }
     arrays = read_npz(path, maker=_maker(path))
-    read = Trajectory(**CODEC.from_arrays(Trajectory, arrays, path, shapes))
+    runs = _sampled(arrays, shapes, path) if "run_sizes" in arrays else {}
+    known = CODEC.from_arrays(Trajectory, arrays, path, shapes, without=runs)
+    read = Trajectory(**known, **runs)
     _check_names(At(read.joints, path, "joint_names"), world.joints)
     _check_names(At(read.surfaces, path, "surfaces"), world.surfaces)
     return read
+
+
+def _sampled(
+    arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Any], path: Path
+) -> dict[str, Any]:
+    """What is sampled of a trajectory that was written as what gives the samples.
+
+    Raises:
+        InputError: They are not those of this robot or do not fit together.
+    """
+    try:
+        out = sampled(runs_of_arrays(arrays))
+    except (ValueError, KeyError, IndexError, TypeError) as e:
+        text = f"whole runs of a planned trajectory ({e}); {_maker(path)}"
+        raise InputError(text, path, "run_sizes") from e
+    rows = len(arrays.get("time", ()))
+    for name, key in ("q", "qpos"), ("v", "qvel"), ("tau", "tau"):
+        wanted = rows, shapes[key][1]
+        if out[name].shape != wanted:
+            raise InputError(f"the shape {wanted}", path, key, out[name].shape)
+    return out
 
 
 def _check_names(found: At, wanted: Iterable[str]) -> None:
@@ -355,18 +384,6 @@ def save_timings(folder: str | Path, seconds: Mapping[str, float]) -> None:
 
 def _load_timings(folder: Path) -> dict[str, float]:
     return CODEC.decode(dict[str, float], _read(folder / TIMINGS).key("seconds"))
-
-
-def _same(source: Path, target: Path) -> None:
-    """Have the content of a file under another name too, once on the disk if it can."""
-    if target.exists() and source.samefile(target):
-        return
-    with whole_file(target) as draft:
-        draft.unlink(missing_ok=True)
-        try:
-            os.link(source, draft)
-        except OSError:  # no such file system
-            shutil.copyfile(source, draft)
 
 
 # Worlds and robots.
@@ -463,12 +480,8 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     """Write what physics did, and what it ran: the world and what was last followed."""
     folder = Path(folder)
     _save_world(rollout.world, folder / SCENE)
-    planned = folder / PLANNED_TRAJECTORY
-    if rollout.followed is None and planned.exists():
-        _same(planned, folder / TRAJECTORY)
-    else:
-        followed = rollout.followed or trajectory_of(plan, folder)
-        save_trajectory(followed, folder / TRAJECTORY)
+    followed = rollout.followed or in_steps(trajectory_of(plan, folder))
+    save_trajectory(followed, folder / TRAJECTORY)
     write_npz(folder / ROLLOUT, CODEC.arrays(rollout, without=_NOT_IN_ROLLOUT))
     write_json(
         folder / EXECUTION,
@@ -477,6 +490,7 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
             **CODEC.object(rollout, without=_NOT_IN_EXECUTION),
             "fell": rollout.fell,
             "stopped": rollout.stopped,
+            "as_planned": rollout.followed is None,
         },
     )
 
@@ -497,9 +511,11 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     arrays = read_npz(path, maker=_maker(path))
     plan = _read(folder / PLAN)
     scene, written = plan.key("sequence").key("scene"), {}
+    as_planned = False
     if with_events:
         execution = _read(folder / EXECUTION)
         scene, written = execution.key("scene"), _execution_of(execution)
+        as_planned = execution.object().get("as_planned") is True
     robot = CODEC.decode(Robot, plan.key("robot"))
     world = _load_world(folder / SCENE, robot, CODEC.decode(Scene, scene))
     m, surfaces = world.model, tuple(world.surfaces)
@@ -512,10 +528,7 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     }
     read = CODEC.from_arrays(Rollout, arrays, path, shapes, without=_NOT_IN_ROLLOUT)
     _check_names(At(read["surfaces"], path, "surfaces"), surfaces)
-    path, planned = folder / TRAJECTORY, folder / PLANNED_TRAJECTORY
-    both = path.exists() and planned.exists()
-    as_planned = both and filecmp.cmp(path, planned, shallow=False)
-    followed = None if as_planned else load_trajectory(path, world)
+    followed = None if as_planned else load_trajectory(folder / TRAJECTORY, world)
     return Rollout(**read, **written, world=world, followed=followed)
 
 
