@@ -528,7 +528,8 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     }
     read = CODEC.from_arrays(Rollout, arrays, path, shapes, without=_NOT_IN_ROLLOUT)
     _check_names(At(read["surfaces"], path, "surfaces"), surfaces)
-    followed = None if as_planned else load_trajectory(folder / TRAJECTORY, world)
+    ran = load_trajectory(folder / TRAJECTORY, world)
+    followed = None if as_planned else ran
     return Rollout(**read, **written, world=world, followed=followed)
 
 
