@@ -38,7 +38,8 @@ from clamber.errors import InputError
 from conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUN, YAML, REST = ("sh", "console", "python"), ("yaml",), ("text", "math")
+RUN, YAML = ("sh", "console", "python"), ("yaml",)
+REST = ("text", "math", "cpp")
 NOTE = re.compile(r"<!-- (file|slow|read only|exit):? ?(.*?) -->")
 # Programs other than clamber that pages name; their lines are not run.
 FOREIGN = {"make", "pip", "python", "dask", "source", "git", "cd"}
