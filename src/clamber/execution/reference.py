@@ -211,7 +211,11 @@ def in_steps(t: Trajectory) -> Trajectory:
     """The trajectory, sampled, in multiples of `STEPS`."""
     unit = np.full(np.shape(t.q)[1], STEPS["q"])
     unit[3:7] = STEPS["quaternion"]
-    pairs = {"q": (t.q, unit), "v": (t.v, STEPS["v"]), "tau": (t.tau, STEPS["tau"])}
-    return replace(
-        t, **{n: np.rint(np.asarray(x) / d) * d for n, (x, d) in pairs.items()}
-    )
+    units = {"q": unit, "v": STEPS["v"], "tau": STEPS["tau"]}
+    out = {}
+    for name, step in units.items():
+        out[name] = x = np.array(getattr(t, name))
+        x *= 1.0 / step  # powers of two
+        np.rint(x, out=x)
+        x *= step
+    return replace(t, **out)

@@ -440,7 +440,9 @@ def _profile(length: float, cruise: float, stride: int = 1) -> np.ndarray:
     )
     rate = np.where(t <= ramp, up_rate, np.where(t <= ramp + plateau, 1.0, down_rate))
     scale = length / (ramp + plateau)
-    return np.stack([s * scale, rate * scale], axis=1)
+    out = np.stack([s * scale, rate * scale], axis=1)
+    out.setflags(write=False)
+    return out
 
 
 def _made(phases: Sequence[Phase], i: int) -> Contact | None:
