@@ -93,6 +93,8 @@ void qp(Random& random, Outcome& outcome);
 void statics(Random& random, Outcome& outcome);
 void geometry(Random& random, Outcome& outcome);
 void proximity(Random& random, Outcome& outcome);
+void posture(Random& random, Outcome& outcome);
+void path(Random& random, Outcome& outcome);
 
 constexpr Part PARTS[] = {
     {"polygon", polygon},
@@ -100,6 +102,8 @@ constexpr Part PARTS[] = {
     {"statics", statics},
     {"geometry", geometry},
     {"proximity", proximity},
+    {"posture", posture},
+    {"path", path},
 };
 
 }  // namespace clamber::fuzz
