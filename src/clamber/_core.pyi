@@ -349,8 +349,12 @@ PATH_WEAK: int
 
 # Contact, distance, balance, limits, worst pair, margin of the centre of mass.
 _Residuals = tuple[float, float, float, float, int, float]
+_Solution = tuple[np.ndarray, int, bool, _Residuals]
 # Status, phase, depth or opening, pair, the posture that cannot be held.
 _Verdict = tuple[int, int, float, int, np.ndarray]
+
+def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+    """Unit vector from a new contact to the mass it will support (4.26, 4.27)."""
 
 def highest(
     position: np.ndarray,
@@ -400,12 +404,12 @@ class Workspace:
 
     def solve(
         self, problem: Problem, q: np.ndarray, iterations: int, tolerance: float
-    ) -> tuple[np.ndarray, int, bool, _Residuals]:
+    ) -> _Solution:
         """Iterate from q: q, iterations, whether it converged, residuals."""
 
     def solve_hard(
         self, problem: Problem, q: np.ndarray, hint: np.ndarray | None
-    ) -> tuple[np.ndarray, int, bool, _Residuals]:
+    ) -> _Solution:
         """Solve with more than one way to get there."""
 
     def residuals(self, problem: Problem, q: np.ndarray) -> _Residuals:
@@ -475,6 +479,26 @@ class Workspace:
         contact_values: np.ndarray,
     ) -> np.ndarray:
         """Postures from one to another with contacts closed, near the straight way."""
+
+    def rolled(
+        self,
+        contact: np.ndarray,
+        contact_values: np.ndarray,
+        q: np.ndarray,
+        towards: np.ndarray,
+    ) -> tuple[int, np.ndarray]:
+        """The edge, -1 for none, on which it comes nearest to a point; its middle."""
+
+    def stances(
+        self,
+        before: np.ndarray,
+        after: np.ndarray,
+        contacts: list[tuple[np.ndarray, np.ndarray]],
+        margin: float,
+        shifted: np.ndarray | None,
+        touching: np.ndarray | None,
+    ) -> tuple[list[tuple[int, np.ndarray]], list[_Solution], np.ndarray]:
+        """Edges of contacts that are let go; shift and touch; what cannot be held."""
 
     def path(
         self,

@@ -17,6 +17,9 @@ constexpr double DRIFT_TOL = 0.002;     // [m] contacts that drift by more refin
 constexpr double OVERLAP_TOL = 0.001;   // [m] links that enter others by more refine it
 constexpr int MAX_REFINEMENTS = 4;       // halvings between two postures
 constexpr double ENDS = 5.0;  // a swing's first and last fifth: supports may be touched
+constexpr double REACH_ANGLE = 25.0 * M_PI / 180.0;  // phi of (4.27)
+constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
+constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
 constexpr double COM_WEIGHT = 0.3, ELLIPSE_WEIGHT = 2.0;
 
 }  // namespace
@@ -73,7 +76,8 @@ void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
 PathPlanner::PathPlanner(const Model& model)
     : solver(model), model_(model), holding_(model), tangent_(model.nv), reference_(model.nq) {}
 
-void PathPlanner::ask_balance(const std::vector<Contact>& contacts, double margin,
+void PathPlanner::ask_balance(const std::vector<Contact>& loaded,
+                              const std::vector<Contact>& unloaded, double margin,
                               double posture_weight) {
     Problem& p = problem_;
     p = Problem{};
@@ -82,12 +86,15 @@ void PathPlanner::ask_balance(const std::vector<Contact>& contacts, double margi
     p.ellipse_weight = ELLIPSE_WEIGHT;
     p.com_weight = COM_WEIGHT;
     p.clearance.assign(model_.pairs.size(), CLEARANCE);
-    for (const Contact& c : contacts) {
-        p.tasks.push_back(closed_task(model_, c));
-        const auto& [planned, further] = model_.touching[c.surface][c.support];
-        const double nothing = -std::numeric_limits<double>::infinity();
-        for (const int i : further) p.clearance[i] = FURTHER_CLEARANCE;
-        for (const int i : planned) p.clearance[i] = c.edge >= 0 ? 0.0 : nothing;
+    const double nothing = -std::numeric_limits<double>::infinity();
+    for (const auto* contacts : {&loaded, &unloaded}) {
+        for (const Contact& c : *contacts) {
+            p.tasks.push_back(closed_task(model_, c));
+            p.tasks.back().loaded = contacts == &loaded;
+            const auto& [planned, further] = model_.touching[c.surface][c.support];
+            for (const int i : further) p.clearance[i] = FURTHER_CLEARANCE;
+            for (const int i : planned) p.clearance[i] = c.edge >= 0 ? 0.0 : nothing;
+        }
     }
 }
 
@@ -117,7 +124,7 @@ void PathPlanner::bridge_node(const std::vector<double>& near,
 
 void PathPlanner::bridge(const std::vector<double>& a, const std::vector<double>& b,
                          const std::vector<Contact>& contacts, Postures& out) {
-    ask_balance(contacts, BRIDGE_MARGIN, 1.0);
+    ask_balance(contacts, {}, BRIDGE_MARGIN, 1.0);
     problem_.ellipse_weight = problem_.com_weight = 0.0;
     difference(model_, a.data(), b.data(), tangent_.data());
     double way = 0.0;
@@ -198,7 +205,7 @@ void PathPlanner::swing(const Transition& t, Path& out) {
         slides = slides || (c.surface == t.made.surface && c.support == t.made.support);
     arc(p1, t.made.position, highest(support, p1, t.made.position), slides, ARC_POINTS,
         out.control);
-    ask_balance(t.held, t.margin, 0.3);
+    ask_balance(t.held, {}, t.margin, 0.3);
     SurfaceTask reach = closed_task(model_, t.made);
     reach.kind = TaskKind::Reaching;
     reach.edge = -1;
@@ -353,6 +360,76 @@ void PathPlanner::check(const Transition& t, Path& out) {
         out.status = Path::Status::Overlaps;
     else if (!out.weak.empty())
         out.status = Path::Status::Weak;
+}
+
+Vec3 lean_direction(const Vec3& p1, const Vec3& p2, const Mat3& R_WB) {
+    const Vec3 way = p1 - p2;
+    const double length = norm(way);
+    Vec3 angles;
+    if (length > 1e-9) angles = tmul(R_WB, way * (1.0 / length)) * REACH_ANGLE;
+    Vec3 lean = R_WB * Vec3{angles.x, angles.y, 0.0};
+    lean.z = 0.0;
+    const double angle = norm(lean);
+    lean *= std::sin(angle) / std::max(angle, 1e-9);
+    lean.z = std::sqrt(std::max(1.0 - square(lean), 0.0));
+    return lean;
+}
+
+Contact PathPlanner::rolled(const Contact& c, const Vec3& towards, const double* q) {
+    const Surface& s = model_.surfaces[c.surface];
+    Contact out = c;
+    if (s.edges.empty() || c.edge >= 0) return out;
+    solver.kin.update(q);
+    double farthest = -FAR;
+    for (int i = 0; i < static_cast<int>(s.edges.size()); ++i) {
+        const Vec3& normal = model_.supports[c.support].normal;
+        const Vec3 p = solver.kin.contact_point(c.surface, i, normal);
+        const double along = dot(p, towards - c.position);
+        if (!(along > farthest)) continue;
+        farthest = along;
+        out.edge = i;
+        out.position = p;
+    }
+    return out;
+}
+
+void PathPlanner::stances(Transition& t, const double* shifted_hint,
+                          const double* touching_hint, Between& out) {
+    Vec3 middle;
+    for (const Contact& c : t.held) middle += c.position * (1.0 / t.held.size());
+    for (Contact& c : t.rolling) c = rolled(c, middle, t.before.data());
+    ask_balance(t.held, t.rolling, t.margin, STANCE_WEIGHT);
+    problem_.q_reference = t.before;
+    solver.solve_hard(problem_, t.before.data(), shifted_hint, out.shifted);
+    t.shifted = out.shifted.q;
+    t.touching = t.after;
+    out.touches = t.makes && out.shifted.residuals.solved();
+    if (out.touches) {
+        const Surface& s = model_.surfaces[t.made.surface];
+        solver.kin.update(t.shifted.data());
+        const Vec3 p1 = solver.kin.contact_point(t.made.surface, -1,
+                                                 model_.supports[t.made.support].normal);
+        const Mat3 R_WB = solver.kin.rotation(model_.base);
+        ask_balance(t.held, {t.made}, t.margin, STANCE_WEIGHT);
+        problem_.q_reference.resize(model_.nq);
+        for (int i = 0; i < model_.nq; ++i)
+            problem_.q_reference[i] = 0.5 * (t.shifted[i] + t.after[i]);
+        PointingTask lean;
+        lean.start_body[0] = s.body;
+        lean.start[0] = s.whole.centre;
+        lean.end_body[0] = s.mass_body;
+        lean.end[0] = s.mass_point;
+        lean.direction = lean_direction(p1, t.made.position, R_WB);
+        lean.weight = LEAN_WEIGHT;
+        problem_.pointing.push_back(lean);
+        solver.solve_hard(problem_, t.after.data(), touching_hint, out.touching);
+        t.touching = out.touching.q;
+    }
+    out.weak.clear();
+    if (!out.shifted.residuals.solved()) return;
+    if (out.touches && !out.touching.residuals.solved()) return;
+    if (!is_stable(t.held, t.shifted.data())) out.weak = t.shifted;
+    if (out.touches && !is_stable(t.held, t.touching.data())) out.weak = t.touching;
 }
 
 void PathPlanner::plan(const Transition& t, Path& out) {

@@ -26,6 +26,13 @@ struct Transition {
     bool adapt = true;    // push control points away from collisions (4.30)
 };
 
+// The postures between: the weight shifted, the new contact closed but not loaded.
+struct Between {
+    Solution shifted, touching;
+    bool touches = false;      // a contact is made, and the weight could be shifted
+    std::vector<double> weak;  // (nq) the first of them that cannot be held
+};
+
 struct Path {
     enum class Status : int { Solved = 0, Opens = 1, Overlaps = 2, Weak = 3 };
 
@@ -43,6 +50,12 @@ class PathPlanner {
     explicit PathPlanner(const Model& model);
 
     void plan(const Transition& t, Path& out);
+    // Shift and touch between the postures before and after; broken contacts roll onto
+    // their edges. The hints are postures that solve similar problems, or none.
+    void stances(Transition& t, const double* shifted_hint, const double* touching_hint,
+                 Between& out);
+    // A flat contact on the edge that lies farthest towards a point, others as they are.
+    Contact rolled(const Contact& c, const Vec3& towards, const double* q);
     // What is wrong with the phases of a path.
     void check(const Transition& t, Path& out);
     // Postures from a to b with all contacts closed, near the straight way.
@@ -63,8 +76,9 @@ class PathPlanner {
         double share;
         std::vector<double> q;
     };
-    // Balance on contacts, near a posture.
-    void ask_balance(const std::vector<Contact>& contacts, double margin,
+    // Balance on contacts that bear load, with others in contact, near a posture.
+    void ask_balance(const std::vector<Contact>& loaded,
+                     const std::vector<Contact>& unloaded, double margin,
                      double posture_weight);
     void swing(const Transition& t, Path& out);
     void swing_node(const Transition& t, const std::vector<Vec3>& control, double share,
@@ -98,6 +112,9 @@ class PathPlanner {
     std::array<std::vector<Eased>, 2> ends_;  // near the supports, at lift-off, touch-down
 };
 
+// Unit vector from a new contact at p2, which comes from p1, to the mass that it will
+// support (4.26, 4.27): leaning towards where it comes from.
+Vec3 lean_direction(const Vec3& p1, const Vec3& p2, const Mat3& R_WB);
 // A task that closes a contact in its place.
 SurfaceTask closed_task(const Model& model, const Contact& c);
 // Height of a support's highest point below the way from p1 to p2; that of its origin where

@@ -241,6 +241,11 @@ nb::tuple as_tuple(const Residuals& r) {
                           r.com_margin);
 }
 
+nb::tuple as_tuple(Solution& s) {
+    return nb::make_tuple(own(std::move(s.q)), s.iterations, s.converged,
+                          as_tuple(s.residuals));
+}
+
 nb::tuple as_tuple(Path& p) {
     return nb::make_tuple(static_cast<int>(p.status), p.phase, p.depth, p.pair,
                           own(std::move(p.weak)));
@@ -306,6 +311,14 @@ void bind_posture(nb::module_& m) {
     m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);
     m.attr("PATH_OVERLAPS") = static_cast<int>(Path::Status::Overlaps);
     m.attr("PATH_WEAK") = static_cast<int>(Path::Status::Weak);
+    m.def("lean_direction",
+          [](const Array1<>& p1, const Array1<>& p2, const Array2<>& R_WB) {
+              check_size(p1.size() + p2.size() + R_WB.size(), 15, "points and rotation");
+              const Vec3 d =
+                  lean_direction(read3(p1.data()), read3(p2.data()), read9(R_WB.data()));
+              return own({d.x, d.y, d.z});
+          },
+          "Unit vector from a new contact to the mass it will support (4.26, 4.27).");
     m.def("highest",
           [](const Array1<>& position, const Array1<>& normal, const Array2<>& A,
              const Array1<>& b, const Array1<>& p1, const Array1<>& p2) {
@@ -386,8 +399,7 @@ void bind_posture(nb::module_& m) {
                      const std::lock_guard lock(w.busy);
                      w.planner.solver.solve(p, from, iterations, tolerance, out);
                  }
-                 return nb::make_tuple(own(std::move(out.q)), out.iterations, out.converged,
-                                       as_tuple(out.residuals));
+                 return as_tuple(out);
              },
              "Iterate from q: q, iterations, whether it converged, residuals.")
         .def("solve_hard",
@@ -401,8 +413,7 @@ void bind_posture(nb::module_& m) {
                      const std::lock_guard lock(w.busy);
                      w.planner.solver.solve_hard(p, from, first, out);
                  }
-                 return nb::make_tuple(own(std::move(out.q)), out.iterations, out.converged,
-                                       as_tuple(out.residuals));
+                 return as_tuple(out);
              },
              nb::arg(), nb::arg(), nb::arg().none(),
              "Solve with more than one way to get there.")
@@ -574,6 +585,49 @@ void bind_posture(nb::module_& m) {
                  return stacked(out, nq);
              },
              "Postures from one to another with contacts closed, near the straight way.")
+        .def("rolled",
+             [](Workspace& w, const Array2<int>& what, const Array2<>& where,
+                const Array1<>& q, const Array1<>& towards) {
+                 const auto contacts = read_contacts(*w.model, what, where);
+                 check_size(contacts.size(), 1, "contacts");
+                 check_size(towards.size(), 3, "towards");
+                 const std::lock_guard lock(w.busy);
+                 const Contact c =
+                     w.planner.rolled(contacts[0], read3(towards.data()), w.posture(q));
+                 return nb::make_tuple(c.edge, own({c.position.x, c.position.y, c.position.z}));
+             },
+             "The edge, -1 for none, on which a flat contact comes nearest to a point, and "
+             "its middle.")
+        .def("stances",
+             [](Workspace& w, const Array1<>& before, const Array1<>& after,
+                const std::vector<Packed>& contacts, double margin,
+                std::optional<Array1<>> shifted_hint, std::optional<Array1<>> touching_hint) {
+                 Transition t;
+                 w.read_contacts_of(t, contacts);
+                 const std::size_t nq = w.model->nq;
+                 t.before.assign(w.posture(before), before.data() + nq);
+                 t.after.assign(w.posture(after), after.data() + nq);
+                 t.margin = margin;
+                 const double* hints[2] = {shifted_hint ? w.posture(*shifted_hint) : nullptr,
+                                           touching_hint ? w.posture(*touching_hint) : nullptr};
+                 Between out;
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.stances(t, hints[0], hints[1], out);
+                 }
+                 nb::list rolling;
+                 for (const Contact& c : t.rolling)
+                     rolling.append(nb::make_tuple(
+                         c.edge, own({c.position.x, c.position.y, c.position.z})));
+                 nb::list found;
+                 found.append(as_tuple(out.shifted));
+                 if (out.touches) found.append(as_tuple(out.touching));
+                 return nb::make_tuple(rolling, found, own(std::move(out.weak)));
+             },
+             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(),
+             "Edges of broken contacts as they are let go, the solutions of shift and touch, "
+             "and the first of them that cannot be held.")
         .def("path",
              [](Workspace& w, const std::vector<Array1<>>& postures,
                 const std::vector<Packed>& contacts, double margin, bool adapt) {

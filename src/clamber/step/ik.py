@@ -276,7 +276,9 @@ class IK:
         that sets out pays for it at first. Where that has not paid off in the end, the
         solve begins again without.
         """
-        return _solution(self.core.solve(self._ask(problem), q, iterations, tolerance))
+        return as_solution(
+            self.core.solve(self._ask(problem), q, iterations, tolerance)
+        )
 
     def solve_hard(
         self,
@@ -296,7 +298,7 @@ class IK:
             q: (nq,) to start from.
             hint: (nq,) a posture that solves a similar problem, tried first.
         """
-        return _solution(self.core.solve_hard(self._ask(problem), q, hint))
+        return as_solution(self.core.solve_hard(self._ask(problem), q, hint))
 
     def residuals(self, problem: PostureProblem, q: np.ndarray) -> Residuals:
         """Recompute everything from the model at `q`."""
@@ -336,7 +338,8 @@ class IK:
         return asked
 
 
-def _solution(found: tuple[np.ndarray, int, bool, tuple]) -> Solution:
+def as_solution(found: tuple[np.ndarray, int, bool, tuple]) -> Solution:
+    """What the core returns of a solve, as a record."""
     q, iterations, converged, residuals = found
     return Solution(
         q=q,

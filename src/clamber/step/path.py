@@ -22,7 +22,7 @@ from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.ik import IK
 from clamber.step.stability import limiting_joint
-from clamber.step.tasks import packed_contacts
+from clamber.step.tasks import packed_contacts, packed_parts
 from clamber.step.transition import Transition
 
 ARC_WEIGHT: float = _core.ARC_WEIGHT  # of the arc, against posture 0.3 and constraints
@@ -76,7 +76,12 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
     """
     t = transition
     postures = [t.before, t.shifted, t.touching, t.after]
-    *postures, control, found = ik.core.path(postures, _packed(ik, t), t.margin, adapt)
+    *postures, control, found = ik.core.path(
+        postures,
+        packed_parts(ik.world, t.held, t.rolling, t.step.makes),
+        t.margin,
+        adapt,
+    )
     phases = contact_phases(
         t.stance, t.held, t.rolling, t.step.makes, postures, control
     )
@@ -97,13 +102,13 @@ def check_phases(
         t: Whose contacts are looked at.
         postures: (n, nq) of shift, swing and settle.
     """
-    return _verdict(ik, t, ik.core.check_path(list(postures), _packed(ik, t)))
-
-
-def _packed(ik: IK, t: Transition) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Contacts that stay, those that are broken, and the new one."""
-    made = () if t.step.makes is None else (t.step.makes,)
-    return [packed_contacts(ik.world, c) for c in (t.held, t.rolling, made)]
+    return _verdict(
+        ik,
+        t,
+        ik.core.check_path(
+            list(postures), packed_parts(ik.world, t.held, t.rolling, t.step.makes)
+        ),
+    )
 
 
 _KINDS = ("shift", "swing", "settle")

@@ -198,6 +198,17 @@ def packed_contacts(
     return what, where
 
 
+def packed_parts(
+    world: World,
+    held: Sequence[Contact],
+    broken: Sequence[Contact],
+    made: Contact | None,
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Contacts that stay, those that are broken and the new one of a step."""
+    new = () if made is None else (made,)
+    return [packed_contacts(world, c) for c in (held, broken, new)]
+
+
 # From the middle of one or two places (body, point (3,) in its frame) to that of
 # others, in a direction (3,) of the world, with a weight.
 Pointing = tuple[

@@ -23,17 +23,22 @@ from clamber.step.ik import (
     PostureProblem,
     Residuals,
     Solution,
+    as_solution,
     contact_clearance,
 )
 from clamber.step.posture import CLEARANCE, Keyframe
-from clamber.step.stability import is_stable, limiting_joint
-from clamber.step.tasks import SurfaceTask, closed, sliding
+from clamber.step.stability import limiting_joint
+from clamber.step.tasks import (
+    SurfaceTask,
+    closed,
+    packed_contacts,
+    packed_parts,
+    sliding,
+)
 
-REACH_ANGLE = np.radians(25.0)  # phi of (4.27)
 MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
 # that can be kept
 ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
-LEAN_WEIGHT = 0.5  # soft task (4.27)
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
 
 
@@ -77,52 +82,21 @@ class Transition:
         return tuple(c for c in self.stance if c.surface in self.step.breaks)
 
 
-def reach_to_support(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
-    """(pitch, roll, yaw) of the moving link at its contact (4.26, 4.27) [rad].
-
-    Args:
-        p1: (3,) present contact point in the world.
-        p2: (3,) goal contact point in the world.
-        R_WB: (3, 3) the pelvis in the world.
-    """
-    p = p1 - p2
-    n = np.linalg.norm(p)
-    return REACH_ANGLE * (R_WB.T @ (p / n)) if n > 1e-9 else np.zeros(3)
-
-
-def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
-    """(3,) unit vector from the new contact to the mass it will support.
-
-    The first two angles of (4.27) lean it from the vertical towards where the contact
-    comes from, so that the mass arrives behind its contact and moves over it as load
-    comes on.
-    """
-    pitch, roll, _ = reach_to_support(p1, p2, R_WB)
-    horizontal = R_WB @ np.array([pitch, roll, 0.0])
-    horizontal[2] = 0.0
-    angle = float(np.linalg.norm(horizontal))
-    horizontal *= np.sin(angle) / max(angle, 1e-9)
-    return horizontal + np.array(
-        [0.0, 0.0, np.sqrt(max(1.0 - horizontal @ horizontal, 0.0))]
-    )
-
-
 def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
     """A flat contact on the edge that lies farthest `towards` (3,); others as they are.
 
     A foot that is about to leave may lift its heel: what it gains in reach is what a
     person gains on tiptoe.
     """
-    edges = ik.world.edges[c.surface]
-    if not edges or c.edge is not None:
+    packed = packed_contacts(ik.world, (c,))
+    return on_edge(c, *ik.core.rolled(*packed, q, towards))
+
+
+def on_edge(c: Contact, edge: int, middle: np.ndarray) -> Contact:
+    """A contact on an edge, whose middle (3,) is there; as it is on none (-1)."""
+    if edge < 0 or edge == c.edge:
         return c
-    ik.kin.update(q)
-    normal = ik.world.supports[c.support].normal
-    points = np.array(
-        [ik.kin.contact_point(c.surface, normal, i) for i in range(len(edges))]
-    )
-    i = int(np.argmax(points @ (towards - c.position)))
-    return replace(c, edge=i, position=points[i])
+    return replace(c, edge=edge, position=middle)
 
 
 def balance_problem(
@@ -187,71 +161,37 @@ def plan_transition(
     new = step.makes.surface if step.makes is not None else None
     held = tuple(c for c in after.stance if c.surface != new)
     leaving = tuple(c for c in before.stance if c.surface in step.breaks)
-    middle = np.mean([c.position for c in held], axis=0)
-    rolling = tuple(rolled(ik, before.q, c, middle) for c in leaving)
-    shift = ik.solve_hard(
-        balance_problem(
-            world, held=held, unloaded=rolling, q_reference=before.q, margin=margin
-        ),
-        before.q,
-        hint=step.seeds.shifted,
-    )
-    solutions, touching = [shift], after.q
     if step.makes is not None:
         made = next(c for c in after.stance if c.surface == step.makes.surface)
         step = replace(step, makes=made)
-        if shift.status is Status.SOLVED:
-            touch = _touch(
-                ik, held, made, shift.q, after.q, margin, step.seeds.touching
-            )
-            solutions.append(touch)
-            touching = touch.q
+    edges, found, weak = ik.core.stances(
+        before.q,
+        after.q,
+        packed_parts(world, held, leaving, step.makes),
+        margin,
+        step.seeds.shifted,
+        step.seeds.touching,
+    )
+    solutions = [as_solution(x) for x in found]
     worst = max(solutions, key=lambda s: list(Status).index(s.status))
     status, note = worst.status, ""
-    for s in solutions if status is Status.SOLVED else ():
-        if not is_stable(ik.kin, s.q, held):
-            status, note = Status.OVERLOADED, limiting_joint(ik.kin, s.q, held)
+    if len(weak):
+        status, note = Status.OVERLOADED, limiting_joint(ik.kin, weak, held)
     return Transition(
         step=step,
         before=before.q,
-        shifted=shift.q,
-        touching=touching,
+        shifted=solutions[0].q,
+        touching=solutions[1].q if len(solutions) > 1 else after.q,
         after=after.q,
         stance=before.stance,
         held=held,
-        rolling=rolling,
+        rolling=tuple(on_edge(c, *x) for c, x in zip(leaving, edges, strict=True)),
         margin=margin,
         iterations=sum(s.iterations for s in solutions),
         status=status,
         note=note,
         residuals=worst.residuals,
     )
-
-
-def _touch(
-    ik: IK,
-    held: tuple[Contact, ...],
-    made: Contact,
-    shifted: np.ndarray,
-    after: np.ndarray,
-    margin: float,
-    hint: np.ndarray | None,
-) -> Solution:
-    """Close the new contact from the loaded posture, the weight still on the rest."""
-    world, kin = ik.world, ik.kin
-    kin.update(shifted)
-    support = world.supports[made.support]
-    p1 = kin.contact_point(made.surface, support.normal)
-    lean = lean_direction(p1, made.position, kin.rotation(world.base))
-    problem = balance_problem(
-        world,
-        held=held,
-        unloaded=(made,),
-        q_reference=0.5 * (shifted + after),
-        margin=margin,
-    )
-    problem = replace(problem, lean=(made.surface, lean, LEAN_WEIGHT))
-    return ik.solve_hard(problem, after, hint=hint)
 
 
 def eased_contacts(
