@@ -48,6 +48,9 @@ Solver::Solver(const Model& model)
       nonzero_(model.nv) {
     std::fill(largest_.begin(), largest_.begin() + std::min(3, model.nv), STEP_TRANSLATION);
     qp_.settings.rho_soft = 1.0 / PENALTY;
+    // H is as convex as its damping; where numbers are so large that it is lost, no step.
+    qp_.settings.eps_prox = 0.0;
+    qp_.settings.iter_limit = 1000;
 }
 
 // How far a joint is beyond its limits, negative within.
@@ -199,6 +202,13 @@ void Solver::solve(const Problem& problem, const double* q, int iterations,
                    double tolerance, Solution& out) {
     rows.ask(problem);
     const double start = look(problem, q, ACTIVE_RANGE);
+    if (!std::isfinite(start)) {  // nothing to descend from
+        out.q.assign(q, q + model.nq);
+        out.iterations = 0;
+        out.converged = false;
+        out.residuals = residuals(problem, q);
+        return;
+    }
     linearise(problem, q);
     Descent found = descend(problem, q, start, iterations, tolerance, true, out.q);
     out.iterations = found.iterations;
