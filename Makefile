@@ -21,6 +21,7 @@ NATIVE := CMakeLists.txt $(shell find src/native -not -path 'src/native/fuzz*')
 NATIVE_TESTS = $(sort $(wildcard tests/test_native_*.py) $(wildcard $(addprefix tests/test_,geometry.py statics.py polygon.py)) \
 	$(shell grep -l 'mark\.native' tests/*.py))
 SANITIZED := build/sanitize
+STOPS := ASAN_OPTIONS=detect_leaks=0:abort_on_error=1 UBSAN_OPTIONS=print_stacktrace=1:abort_on_error=1
 # Without `site` (python -S) no folder's .pth brings in the package that make installed.
 SITE = $(shell $(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 N ?= 20000
@@ -64,11 +65,11 @@ type: $(VENV)/.has-view $(VENV)/.has-video $(VENV)/.has-test $(VENV)/.has-dev ##
 
 sanitize: $(VENV)/.has-test sanitized ## tests of the native core against one that stops at memory errors and undefined behaviour
 	LD_PRELOAD="$$($${CXX:-c++} -print-file-name=libasan.so) $$($${CXX:-c++} -print-file-name=libstdc++.so)" \
-		ASAN_OPTIONS=detect_leaks=0 PYTHONPATH=$(SANITIZED)/site:$(SITE) \
-		$(BIN)/python -S -m pytest -n 0 -m "$(QUICK)" $(NATIVE_TESTS)
+		$(STOPS) PYTHONPATH=$(SANITIZED)/site:$(SITE) \
+		$(BIN)/python -S -m pytest -n 0 --capture=sys -m "$(QUICK)" $(NATIVE_TESTS)
 
 fuzz: sanitized ## N random and degenerate problems for each part of that core
-	ASAN_OPTIONS=detect_leaks=0 $(SANITIZED)/objects/fuzz $(N)
+	$(STOPS) $(SANITIZED)/objects/fuzz $(N)
 
 sanitized: $(VENV)/.can-build
 	@echo "compiling the native core with sanitizers ..."
