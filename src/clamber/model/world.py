@@ -492,34 +492,28 @@ def _leg_joints(
 
 def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
     """Geom pairs whose contacts MuJoCo would compute and that are apart at home."""
-    robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[base]
-    excluded = set(model.exclude_signature.tolist())
+    body = model.geom_bodyid
+    robot = model.body_rootid[body] == model.body_rootid[base]
+    weld = model.body_weldid[body]
+    parent = model.body_weldid[model.body_parentid[weld]]
+    kind, meets = model.geom_contype, model.geom_conaffinity
+    a, b = np.triu_indices(model.ngeom, 1)
+    keep = ((kind[a] & meets[b]) | (kind[b] & meets[a])) != 0
+    keep &= (robot[a] | robot[b]) & (weld[a] != weld[b])
+    own = robot[a] & robot[b]
+    excluded = np.concatenate([model.exclude_signature, [-1]])
+    low, high = np.minimum(body[a], body[b]), np.maximum(body[a], body[b])
+    joined = (weld[b] == parent[a]) | (weld[a] == parent[b])
+    joined |= np.isin((low << 16) + high, excluded)
+    joined |= np.isin((high << 16) + low, excluded)
+    keep &= ~(own & joined)
     fromto = np.zeros(6)
-    out = []
-    for a in range(model.ngeom):
-        for b in range(a + 1, model.ngeom):
-            if not (robot[a] or robot[b]):
-                continue
-            masks = (model.geom_contype[a] & model.geom_conaffinity[b]) | (
-                model.geom_contype[b] & model.geom_conaffinity[a]
-            )
-            ba, bb = int(model.geom_bodyid[a]), int(model.geom_bodyid[b])
-            wa, wb = int(model.body_weldid[ba]), int(model.body_weldid[bb])
-            if not masks or wa == wb:
-                continue
-            if robot[a] and robot[b]:
-                parents = (
-                    model.body_weldid[model.body_parentid[wa]],
-                    model.body_weldid[model.body_parentid[wb]],
-                )
-                if wb == parents[0] or wa == parents[1]:
-                    continue
-                lo, hi = min(ba, bb), max(ba, bb)
-                if (lo << 16) + hi in excluded or (hi << 16) + lo in excluded:
-                    continue
-                if mujoco.mj_geomDistance(model, data, a, b, 1.0, fromto) <= 0:
-                    continue
-            out.append((a, b))
+    out = [
+        (i, j)
+        for i, j in zip(a[keep].tolist(), b[keep].tolist(), strict=True)
+        if not (robot[i] and robot[j])
+        or mujoco.mj_geomDistance(model, data, i, j, 1.0, fromto) > 0
+    ]
     return np.array(out, dtype=np.int32).reshape(-1, 2)
 
 
