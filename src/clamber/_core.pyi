@@ -353,6 +353,9 @@ _Solution = tuple[np.ndarray, int, bool, _Residuals]
 # Status, phase, depth or opening, pair, the posture that cannot be held.
 _Verdict = tuple[int, int, float, int, np.ndarray]
 
+def on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Postures (n, nq), tangent vectors (n, nv) of raw coordinates and their slopes."""
+
 def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
     """Unit vector from a new contact to the mass it will support (4.26, 4.27)."""
 

@@ -188,6 +188,20 @@ void difference(const Model& model, const double* a, const double* b, double* ou
     }
 }
 
+void on_manifold(const double* slope, std::size_t n, double* q, double* v) {
+    const double *a = q + 3, *b = slope + 3;
+    const double size = std::sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3]);
+    double unit[4], rate[4], along = 0.0;
+    for (int k = 0; k < 4; ++k) unit[k] = a[k] / size;
+    for (int k = 0; k < 4; ++k) along += unit[k] * b[k];
+    for (int k = 0; k < 4; ++k) rate[k] = (b[k] - unit[k] * along) / size;
+    const Quat turn = conjugate(readq(unit)) * readq(rate);
+    std::copy(unit, unit + 4, q + 3);
+    std::copy(slope, slope + 3, v);
+    v[3] = 2.0 * turn.x, v[4] = 2.0 * turn.y, v[5] = 2.0 * turn.z;
+    std::copy(slope + 7, slope + n, v + 6);
+}
+
 Quat quat_from_matrix(const Mat3& R) {
     const double trace = R(0, 0) + R(1, 1) + R(2, 2);
     Quat q;

@@ -129,6 +129,9 @@ class Kinematics {
 // (nq) q moved along the tangent vector v for unit time, and the vector from a to b.
 void integrate(const Model&, const double* q, const double* v, double* out);
 void difference(const Model&, const double* a, const double* b, double* out);
+// Raw coordinates (n) of a free joint and hinges, brought onto the manifold in place, and
+// the tangent vector (n - 1) that goes with their slope.
+void on_manifold(const double* slope, std::size_t n, double* q, double* v);
 Quat quat_from_matrix(const Mat3& R);
 // z along the normal, x along the heading as far as it can.
 Mat3 frame_from_normal(const Vec3& normal, const Vec3& heading);

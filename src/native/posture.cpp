@@ -198,6 +198,18 @@ void bind_posture(nb::module_& m) {
     m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);
     m.attr("PATH_OVERLAPS") = static_cast<int>(Path::Status::Overlaps);
     m.attr("PATH_WEAK") = static_cast<int>(Path::Status::Weak);
+    m.def("on_manifold",
+          [](const Array2<>& raw, const Array2<>& slope) {
+              const std::size_t n = raw.shape(0), nq = raw.shape(1);
+              check_size(slope.size(), raw.size(), "slope");
+              if (nq < 7) throw std::invalid_argument("q begins with a free joint");
+              std::vector<double> q(raw.data(), raw.data() + n * nq), v(n * (nq - 1));
+              for (std::size_t i = 0; i < n; ++i)
+                  on_manifold(slope.data() + i * nq, nq, q.data() + i * nq,
+                              v.data() + i * (nq - 1));
+              return nb::make_tuple(own(std::move(q), {n, nq}), own(std::move(v), {n, nq - 1}));
+          },
+          "Postures (n, nq) and tangent vectors (n, nv) of raw coordinates and their slopes.");
     m.def("lean_direction",
           [](const Array1<>& p1, const Array1<>& p2, const Array2<>& R_WB) {
               check_size(p1.size() + p2.size() + R_WB.size(), 15, "points and rotation");

@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
@@ -308,21 +309,8 @@ class _Spline:
 
     def sample(self, s: np.ndarray, sdot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raw, slope = self.curve(s), self.curve(s, 1)
-        q, v = _on_manifold(raw, slope)
+        q, v = _core.on_manifold(raw, slope)
         return q, v * sdot[:, None]
-
-
-def _on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Configurations (n, nq) and tangent vectors (n, nv) of raw coordinates."""
-    q = raw.copy()
-    norm = np.linalg.norm(raw[:, 3:7], axis=1, keepdims=True)
-    unit = raw[:, 3:7] / norm
-    q[:, 3:7] = unit
-    rate = (
-        slope[:, 3:7] - unit * np.sum(unit * slope[:, 3:7], axis=1, keepdims=True)
-    ) / norm
-    omega = 2.0 * quat_multiply(quat_conjugate(unit), rate)[:, 1:]
-    return q, np.concatenate([slope[:, :3], omega, slope[:, 7:]], axis=1)
 
 
 def _through(
@@ -341,7 +329,7 @@ def _spline(kin: Kinematics, phase: Phase, speed: float) -> _Spline:
     spline = _through(s, nodes, phase_torques(kin, phase), np.inf)
     curve = spline.curve
     fine = np.linspace(0.0, s[-1], SAMPLES * len(nodes))
-    _, slope = _on_manifold(curve(fine), curve(fine, 1))
+    _, slope = _core.on_manifold(curve(fine), curve(fine, 1))
     slope = np.abs(slope)
     slope[:, :3] /= BASE_LENGTH
     cruise = float((speed / np.maximum(slope.max(axis=0), 1e-9)).min())
@@ -376,7 +364,7 @@ def _balanced_cruise(
     mass has to the border of the support polygon.
     """
     fine = np.linspace(0.0, length, BALANCE_SAMPLES)
-    q = _on_manifold(curve(fine), curve(fine, 1))[0]
+    q = _core.on_manifold(curve(fine), curve(fine, 1))[0]
     com = kin.core.centres_of_mass(q)
     kin.update(q[-1])
     points = contact_points(kin, phase.contacts).points
@@ -459,14 +447,14 @@ def _fastest(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """s, ds/dt (n,) and torques (n, na) of the fastest motion along a phase."""
     grid = np.linspace(0.0, spline.length, GRID)
-    q, slope = _on_manifold(spline.curve(grid), spline.curve(grid, 1))
+    q, slope = _core.on_manifold(spline.curve(grid), spline.curve(grid, 1))
     s, rate = retime(
         kin, grid, q, slope, _bend(spline.curve, grid), phase.contacts, made
     )
     change = np.gradient(rate, 1.0 / RATE) if len(rate) > 1 else np.zeros(1)
     look = np.unique([*range(0, len(s), TORQUE_STRIDE), len(s) - 1])
     raw = spline.curve(s[look])
-    q, slope = _on_manifold(raw, spline.curve(s[look], 1))
+    q, slope = _core.on_manifold(raw, spline.curve(s[look], 1))
     bend = _bend(spline.curve, s[look])
     tau = []
     every, price_of = handed_over(phase, s[look] / spline.length)
