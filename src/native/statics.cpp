@@ -99,7 +99,7 @@ double Statics::contact_forces(const ContactPointsView& contacts, const LoadView
                                double (*forces)[3]) {
     const int n = 3 * contacts.n, na = torque.na, rows = 6 + na, edges = contacts.cone_edges;
     if (forces != nullptr) std::fill_n(&forces[0][0], n, 0.0);
-    if (n == 0) return 1.0;
+    if (n == 0 || !(load.mass > 0.0)) return 1.0;
     // x: forces in contact frames [weights], at their price.
     double* const H = zeroed(H_, n * n);
     double* const c = zeroed(c_, n);
