@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from dataclasses import replace
 
 import mujoco
@@ -10,6 +12,7 @@ import pytest
 
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Replanned, Stopped
+from clamber.execution.executive import Executive
 from clamber.execution.simulation import (
     FALLEN_HEIGHT,
     FALLEN_TILT,
@@ -45,6 +48,24 @@ def start_only(demo_plan):
 @pytest.fixture(scope="module")
 def figures(demo_rollout):
     return measure(demo_rollout)
+
+
+def test_a_run_lets_go_of_its_buffers_when_it_is_over(start_only, monkeypatch):
+    """Without waiting for the garbage collector: a sweep makes thousands."""
+    made, plain = [], Executive.__init__
+
+    def noted(self, *args):
+        plain(self, *args)
+        made.append(weakref.ref(self))
+
+    monkeypatch.setattr(Executive, "__init__", noted)
+    gc.collect()
+    gc.disable()
+    try:
+        simulate(start_only)
+        assert [x() for x in made] == [None]
+    finally:
+        gc.enable()
 
 
 def failed(plan, rollout, figures) -> set[Figure]:

@@ -178,6 +178,10 @@ class Executive:
             self.watch.look(self.estimate.load, self._in_use)
         next(self._behaviour)
 
+    def close(self) -> None:
+        """The run is over: its actions let go of what they hold."""
+        self._behaviour.close()
+
     def balance(self) -> None:
         """Move the centre of mass from its reference where balance asks for it."""
         if not self._slow:  # in faster motion the robot need not balance statically

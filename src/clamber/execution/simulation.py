@@ -159,6 +159,8 @@ def simulate(
                 break
             mujoco.mj_step(model, data)
     report("simulate", 1.0, "")
+    if isinstance(follower, Executive):
+        follower.close()
     recorded = loop.recorded()
     return Rollout(
         world=world,
