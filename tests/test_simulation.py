@@ -50,7 +50,7 @@ def figures(demo_rollout):
     return measure(demo_rollout)
 
 
-def test_a_run_lets_go_of_its_buffers_when_it_is_over(start_only, monkeypatch):
+def test_a_run_lets_go_of_its_buffers_when_it_is_over(one_hand_plan, monkeypatch):
     """Without waiting for the garbage collector: a sweep makes thousands."""
     made, plain = [], Executive.__init__
 
@@ -62,7 +62,7 @@ def test_a_run_lets_go_of_its_buffers_when_it_is_over(start_only, monkeypatch):
     gc.collect()
     gc.disable()
     try:
-        simulate(start_only)
+        simulate(one_hand_plan)
         assert [x() for x in made] == [None]
     finally:
         gc.enable()
