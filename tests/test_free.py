@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -151,6 +152,18 @@ def test_what_is_found_does_not_depend_on_the_number_of_threads(ik, goal, monkey
     for route in routes[1:]:
         for a, b in zip(route.keyframes, routes[0].keyframes, strict=True):
             assert np.array_equal(a.q, b.q)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_tries_in_threads_of_its_own():
+    def works() -> None:
+        assert search_module._pool(1).submit(len, "ok").result(timeout=10) == 2
+
+    works()
+    child = multiprocessing.get_context("fork").Process(target=works)
+    child.start()
+    child.join()
+    assert child.exitcode == 0
 
 
 def test_where_the_robot_is_there_already_nothing_is_planned(

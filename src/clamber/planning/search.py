@@ -55,6 +55,10 @@ def _pool(workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="clamber")
 
 
+# A forked process has a copy of the pool and none of its threads: it would wait.
+os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
 class Entry(Protocol):
     """What may come next in a search."""
 
