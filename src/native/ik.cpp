@@ -45,7 +45,9 @@ Solver::Solver(const Model& model)
       gradient_(model.nv),
       dq_(model.nv),
       trial_(model.nq),
-      nonzero_(model.nv) {
+      nonzero_(model.nv),
+      bound_active_(model.nv, 0),
+      row_active_(model.pairs.size() + 256, 0) {
     std::fill(largest_.begin(), largest_.begin() + std::min(3, model.nv), STEP_TRANSLATION);
     qp_.settings.rho_soft = 1.0 / PENALTY;
     // H is as convex as its damping; where numbers are so large that it is lost, no step.
@@ -121,7 +123,11 @@ void Solver::linearise(const Problem& problem, const double* q) {
             heavy_[i * nv + j] = heavy_[j * nv + i];
         }
     sense_.assign(m, SOFT);
-    std::fill(sense_.begin(), sense_.begin() + nv, 0);
+    keys_ = rows.keys;
+    for (int d = 0; d < nv; ++d) sense_[d] = bound_active_[d];
+    for (std::size_t i = 0; i < keys_.size(); ++i)
+        if (keys_[i] < static_cast<int>(row_active_.size()))
+            sense_[nv + i] |= row_active_[keys_[i]];
 }
 
 QP Solver::qp() const {
@@ -162,6 +168,23 @@ void Solver::step(double radius, double* dq) {
     factored_ = factored_ && qp_.solve_again(gradient_.data()) > 0;
     if (!factored_) factored_ = qp_.solve(qp()) > 0;  // where it fails, x is zero
     for (int d = 0; d < nv; ++d) dq[d] = std::min(std::max(qp_.x()[d], low_[d]), high_[d]);
+    remember_active();
+}
+
+void Solver::remember_active() {
+    constexpr int BITS = ACTIVE_LOWER;
+    const int* const active = qp_.active_set();
+    for (int d = 0; d < model.nv; ++d)
+        bound_active_[d] = active[d] & ACTIVE ? active[d] & BITS : 0;
+    std::fill(row_active_.begin(), row_active_.end(), 0);
+    for (std::size_t i = 0; i < keys_.size(); ++i)
+        if (keys_[i] < static_cast<int>(row_active_.size()) && active[model.nv + i] & ACTIVE)
+            row_active_[keys_[i]] = active[model.nv + i] & BITS;
+}
+
+void Solver::forget_active() {
+    std::fill(bound_active_.begin(), bound_active_.end(), 0);
+    std::fill(row_active_.begin(), row_active_.end(), 0);
 }
 
 Solver::Descent Solver::descend(const Problem& problem, const double* q, double merit,
@@ -201,6 +224,7 @@ Solver::Descent Solver::descend(const Problem& problem, const double* q, double 
 void Solver::solve(const Problem& problem, const double* q, int iterations,
                    double tolerance, Solution& out) {
     rows.ask(problem);
+    forget_active();
     const double start = look(problem, q, ACTIVE_RANGE);
     if (!std::isfinite(start)) {  // nothing to descend from
         out.q.assign(q, q + model.nq);
@@ -213,6 +237,7 @@ void Solver::solve(const Problem& problem, const double* q, int iterations,
     Descent found = descend(problem, q, start, iterations, tolerance, true, out.q);
     out.iterations = found.iterations;
     if (found.merit > start) {
+        forget_active();
         look(problem, q, ACTIVE_RANGE);
         linearise(problem, q);
         found = descend(problem, q, start, iterations, tolerance, false, out.q);

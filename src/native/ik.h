@@ -55,6 +55,8 @@ class Solver {
                     Solution& out);
     Residuals residuals(const Problem& problem, const double* q);
 
+    // No constraint is active in the next QP to begin with.
+    void forget_active();
     // The merit at `q`, and the QP there.
     double look(const Problem& problem, const double* q, double reach);
     void linearise(const Problem& problem, const double* q);
@@ -81,6 +83,7 @@ class Solver {
     };
     double beyond_limits(std::size_t joint, const double* q) const;
     QP qp() const;  // of a step
+    void remember_active();
     Descent descend(const Problem& problem, const double* q, double merit, int iterations,
                     double tolerance, bool leap, std::vector<double>& x);
 
@@ -90,6 +93,9 @@ class Solver {
     std::vector<double> kept_, closed_, errors_;  // Jacobians, and what is to be closed
     std::vector<double> heavy_, gradient_, low_, high_, dq_, trial_;
     std::vector<int> sense_, nonzero_;
+    std::vector<int> keys_;  // of the kept rows of the QP, as `Rows` has them
+    // Which bounds and rows were active in the QP solved last: the next begins with them.
+    std::vector<int> bound_active_, row_active_;
 };
 
 }  // namespace clamber

@@ -321,6 +321,7 @@ void bind_posture(nb::module_& m) {
                  const std::lock_guard lock(w.busy);
                  Solver& s = w.planner.solver;
                  s.rows.ask(p);
+                 s.forget_active();
                  const double merit = s.look(p, w.posture(q), reach);
                  s.linearise(p, q.data());
                  const std::size_t nv = w.model->nv;

@@ -52,6 +52,7 @@ void Rows::look(Kinematics& kin, Proximity& near, const Problem& problem, double
     closed.source_.clear();
     kept.source_.clear();
     levers_.clear();
+    keys.clear();
     violation = 0.0;
     for (const SurfaceTask& t : problem.tasks) contact(kin, t);
     for (const PointingTask& t : problem.pointing) point(kin, t);
@@ -123,6 +124,7 @@ void Rows::close(double e) {
 void Rows::at_most(double room, const Vec3& com) {
     const double over = std::min(room, 0.0);
     violation += over * over;
+    keys.push_back(static_cast<int>(model_.pairs.size() + keys.size()));
     add(kept, -FAR, room, com);
 }
 
@@ -367,6 +369,7 @@ void Rows::distances(Kinematics& kin, Proximity& near, const Problem& problem,
         if (at.distance < reach) {
             const double lacking = problem.clearance[pair] - at.distance;
             if (lacking > 0.0) violation += lacking * lacking;
+            keys.push_back(pair);
             add(kept, lacking, FAR);
             push(second, at.normal, t);
             push(first, -at.normal, -t);

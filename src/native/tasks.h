@@ -100,6 +100,9 @@ class Rows {
     Block soft, closed, kept;
     double violation = 0.0;  // squared norm of what closed and kept ask for
 
+    // Of each kept row, which it is: the pair, or its order among the others after those.
+    std::vector<int> keys;
+
     // Points that bear load, and the polygon that they span.
     void bearing(const Kinematics& kin, const Problem& problem);
     Polygon polygon;
