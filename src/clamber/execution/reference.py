@@ -6,7 +6,7 @@ yields; it goes on once that is done, or earlier where something may have happen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +24,7 @@ AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 # and a millinewtonmetre: finer than any encoder and motor, and a fraction in a file.
 STEPS = {"q": 2.0**-20, "quaternion": 2.0**-23, "v": 2.0**-15, "tau": 2.0**-10}
 
-Actions = Iterator[None]
+Actions = Generator[None, None, None]
 
 
 class Reference:
