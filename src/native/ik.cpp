@@ -4,6 +4,8 @@ namespace clamber {
 
 namespace {
 
+constexpr std::size_t OTHER_ROWS = 256;  // besides distances, that are remembered
+
 std::vector<Shape> shapes_of(const Model& model) {
     std::vector<Shape> out;
     for (const Geom& g : model.geoms) out.push_back(g.shape);
@@ -47,7 +49,7 @@ Solver::Solver(const Model& model)
       trial_(model.nq),
       nonzero_(model.nv),
       bound_active_(model.nv, 0),
-      row_active_(model.pairs.size() + 256, 0) {
+      row_active_(model.pairs.size() + OTHER_ROWS, 0) {
     std::fill(largest_.begin(), largest_.begin() + std::min(3, model.nv), STEP_TRANSLATION);
     qp_.settings.rho_soft = 1.0 / PENALTY;
     // H is as convex as its damping; where numbers are so large that it is lost, no step.
@@ -171,20 +173,21 @@ void Solver::step(double radius, double* dq) {
     remember_active();
 }
 
-void Solver::remember_active() {
-    constexpr int BITS = ACTIVE_LOWER;
-    const int* const active = qp_.active_set();
-    for (int d = 0; d < model.nv; ++d)
-        bound_active_[d] = active[d] & ACTIVE ? active[d] & BITS : 0;
-    std::fill(row_active_.begin(), row_active_.end(), 0);
-    for (std::size_t i = 0; i < keys_.size(); ++i)
-        if (keys_[i] < static_cast<int>(row_active_.size()) && active[model.nv + i] & ACTIVE)
-            row_active_[keys_[i]] = active[model.nv + i] & BITS;
-}
-
 void Solver::forget_active() {
     std::fill(bound_active_.begin(), bound_active_.end(), 0);
     std::fill(row_active_.begin(), row_active_.end(), 0);
+}
+
+void Solver::remember_active() {
+    const int* const sense = qp_.active_set();
+    const auto bits = [sense](std::size_t i) {
+        return sense[i] & ACTIVE ? sense[i] & ACTIVE_LOWER : 0;
+    };
+    forget_active();
+    for (int d = 0; d < model.nv; ++d) bound_active_[d] = bits(d);
+    for (std::size_t i = 0; i < keys_.size(); ++i)
+        if (keys_[i] < static_cast<int>(row_active_.size()))
+            row_active_[keys_[i]] = bits(model.nv + i);
 }
 
 Solver::Descent Solver::descend(const Problem& problem, const double* q, double merit,

@@ -336,7 +336,8 @@ void PathPlanner::check(const Transition& t, Path& out) {
         watch(*contacts[k], moving, low_);
         for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
             between(nodes[i], nodes[i + 1], 0.5, middle);
-            for (const double* q : {const_cast<const double*>(middle.data()), nodes[i + 1].data()}) {
+            const double* const looked_at[2] = {middle.data(), nodes[i + 1].data()};
+            for (const double* const q : looked_at) {
                 int pair = -1;
                 const double depth = overlap(q, low_, &pair);
                 if (depth > out.depth) {
