@@ -184,6 +184,7 @@ void Solver::remember_active() {
         return sense[i] & ACTIVE ? sense[i] & ACTIVE_LOWER : 0;
     };
     forget_active();
+    if (!factored_) return;  // it failed
     for (int d = 0; d < model.nv; ++d) bound_active_[d] = bits(d);
     for (std::size_t i = 0; i < keys_.size(); ++i)
         if (keys_[i] < static_cast<int>(row_active_.size()))
