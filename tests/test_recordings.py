@@ -88,6 +88,19 @@ def test_an_array_gives_the_true_contacts_whatever_its_unit_axis_and_rate(
     assert f"up: {up} (" in " ".join(back.notes)
 
 
+def test_arrays_of_half_precision_are_read(tmp_path):
+    """They end at 65504: not a number that the limits on coordinates could be."""
+    demo, _ = climb()
+    back = []
+    for name, kind in (("half", np.float16), ("full", np.float32)):
+        p = demo.position.astype(kind)
+        np.savez(
+            tmp_path / f"{name}.npz", positions=p, names=demo.names, rate=demo.rate
+        )
+        back.append(load_demo(tmp_path / f"{name}.npz", scene=demo.scene).position)
+    np.testing.assert_allclose(*back, atol=2e-3)
+
+
 @pytest.mark.parametrize(
     ("suffix", "options"),
     [("c3d", {}), ("trc", {"rate": 200.0, "gaps": 20, "noise": 0.004})],

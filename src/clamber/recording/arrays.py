@@ -95,7 +95,7 @@ def read_array(
     if len(set(names)) != count:
         twice = next(n for n in names if list(names).count(n) > 1)
         raise InputError("different names", path, "names", twice)
-    if raw.dtype.kind != "f":
+    if raw.dtype.kind != "f" or raw.dtype.itemsize < 4:  # half precision ends at 65504
         raw = raw.astype(np.float32)
     return Points(names=unique_names(names), position=raw, rate=rate)
 
