@@ -403,7 +403,7 @@ MISTAKES = {
     "climb --scene tab.yaml": ("tab.yaml: expected YAML", "line 2"),
     "climb --scene field.yaml": ("boxes.0.colour", "mend its name, or leave it out"),
     "climb --scene inside.yaml": ("start is", "move the one or the other"),
-    "climb --speed 0": ("--speed is 0.0", "expected a positive joint speed"),
+    "climb --speed 0": ("--speed is 0.0", "expected a joint speed of at least"),
     "climb --disturb.friction 7": ("--disturb.friction is 7.0", "from 0.01 to 1"),
     "climb --search.tries -1": ("--search.tries is -1", "expected 0 or more"),
     "climb --out word.txt/x": ("--out is 'word.txt/x'", "a folder that can be written"),

@@ -158,15 +158,24 @@ def test_progress_is_reported_stage_by_stage(demo_sequence, coman):
 # What cannot be planned.
 
 
-@pytest.mark.parametrize("speed", [0.0, -0.3, float("nan")])
-def test_a_speed_that_is_not_positive_is_refused(demo_sequence, coman, speed):
-    with pytest.raises(InputError, match=r"speed .* expected a positive joint speed"):
+@pytest.mark.parametrize("speed", [0.0, -0.3, 1e-9, float("nan")])
+def test_a_speed_that_fills_the_memory_or_is_none_is_refused(
+    demo_sequence, coman, speed
+):
+    with pytest.raises(InputError, match=r"speed .* expected a joint speed of at lea"):
         plan(
             demo_sequence,
             coman,
             Scene.from_height(0.275),
             options=PlanOptions(speed=speed),
         )
+
+
+@pytest.mark.parametrize("margin", [float("nan"), float("inf"), -0.01])
+def test_an_option_that_is_no_size_is_refused(demo_sequence, coman, margin):
+    options = PlanOptions(keyframe=KeyframeOptions(balance_margin=margin))
+    with pytest.raises(InputError, match=r"balance_margin .* a number of 0 or more"):
+        plan(demo_sequence, coman, Scene.from_height(0.275), options=options)
 
 
 @pytest.mark.parametrize("scene", [at_distance(3.0), at_distance(0.23, height=3.0)])

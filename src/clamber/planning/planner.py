@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -60,6 +60,9 @@ from clamber.step.path import Phase
 from clamber.step.posture import Keyframe
 
 Start = State | Keyframe
+
+# [rad/s] At this speed a climb takes an hour, and 1000 samples a second of it are kept.
+SLOWEST = 0.003
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -145,11 +148,7 @@ def plan(
         InputError: The scene does not fit the sequence or the policy, or is out of the
             robot's reach; the robot cannot stand there.
     """
-    options = options or PlanOptions()
-    if options.speed != "max" and not options.speed > 0:
-        raise InputError(
-            "a positive joint speed [rad/s], or max", field="speed", value=options.speed
-        )
+    options = _checked(options)
     report, budget = progress or silent, budget or Budget()
 
     def task(scene: Scene, clearance: ExtraClearance) -> _Task:
@@ -195,7 +194,7 @@ def replan(
         InputError: The scene does not fit the sequence, or is out of the robot's reach.
     """
     ik = IK(build_world(robot, scene))
-    search = Search(ik, options or PlanOptions(), budget, progress or silent)
+    search = Search(ik, _checked(options), budget, progress or silent)
     task = _Task(sequence, search, None, counts)
     ranked = [replace(r, plan=task.timed(r.plan)) for r in task.ranked(None)]
     return Replanned(
@@ -203,6 +202,23 @@ def replan(
         ranked=tuple(ranked),
         tried=summary(search.attempts),
     )
+
+
+def _checked(options: PlanOptions | None) -> PlanOptions:
+    """The options, or the usual ones.
+
+    Raises:
+        InputError: The speed or an option of the keyframes is none to plan with.
+    """
+    options = options or PlanOptions()
+    if options.speed != "max" and not options.speed >= SLOWEST:
+        text = f"a joint speed of at least {SLOWEST} rad/s, or max"
+        raise InputError(text, field="speed", value=options.speed)
+    for f in fields(options.keyframe):
+        value = getattr(options.keyframe, f.name)
+        if not 0 <= value < math.inf:
+            raise InputError("a number of 0 or more", field=f.name, value=value)
+    return options
 
 
 class _Task:
