@@ -6,6 +6,7 @@ yields; it goes on once that is done, or earlier where something may have happen
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Generator
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ import numpy as np
 from clamber import _core
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP, World
-from clamber.planning.trajectory import Trajectory
+from clamber.planning.trajectory import Samples, Trajectory
 
 BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
@@ -208,14 +209,20 @@ class Reference:
 
 
 def in_steps(t: Trajectory) -> Trajectory:
-    """The trajectory, sampled, in multiples of `STEPS`."""
+    """The trajectory, in multiples of `STEPS`."""
     unit = np.full(np.shape(t.q)[1], STEPS["q"])
     unit[3:7] = STEPS["quaternion"]
-    units = {"q": unit, "v": STEPS["v"], "tau": STEPS["tau"]}
     out = {}
-    for name, step in units.items():
-        out[name] = x = np.array(getattr(t, name))
-        x *= 1.0 / step  # powers of two
-        np.rint(x, out=x)
-        x *= step
+    for name, step in {"q": unit, "v": STEPS["v"], "tau": STEPS["tau"]}.items():
+        rounded = functools.partial(_multiples, step)
+        x = getattr(t, name)
+        out[name] = x.through(rounded) if isinstance(x, Samples) else rounded(x)
     return replace(t, **out)
+
+
+def _multiples(step: np.ndarray | float, x: np.ndarray) -> np.ndarray:
+    """The nearest multiples of steps that are powers of two."""
+    out = x * (1.0 / step)
+    np.rint(out, out=out)
+    out *= step
+    return out

@@ -446,7 +446,19 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def _single(x: Any) -> np.ndarray:
-    """A table (n, ...) in single precision, where that loses nothing."""
+    """A table (n, ...) in single precision, where that loses nothing.
+
+    What is sampled block after block is never all there in double precision.
+    """
+    if hasattr(x, "blocks"):
+        out, k = np.empty(x.shape, "<f4", order="F"), 0
+        for block in x.blocks():
+            out[k : k + len(block)] = block
+            if not np.array_equal(out[k : k + len(block)], block):
+                break
+            k += len(block)
+        else:
+            return out
     x = np.asarray(x)
     if x.dtype != np.float64 or x.ndim < 2:
         return x
