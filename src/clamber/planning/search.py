@@ -45,7 +45,8 @@ def threads() -> int:
     Fewer where the environment's OMP_NUM_THREADS says so, as it does for processes
     that work side by side.
     """
-    cores = len(os.sched_getaffinity(0))
+    all_ours = getattr(os, "sched_getaffinity", None)  # not on every system
+    cores = len(all_ours(0)) if all_ours else os.cpu_count() or 1
     told = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, min(cores, int(told))) if told.isdecimal() else cores
 
