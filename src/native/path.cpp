@@ -188,12 +188,7 @@ void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& contr
             const double eased = e.distance * (1.0 - ramp) + ramp * CLEARANCE;
             problem_.clearance[e.pair] = std::min(problem_.clearance[e.pair], eased);
         }
-    predicted_ = last;
-    if (!halves) {  // on from the last two, as far again
-        if (!before_.empty()) between(before_, last, 2.0, predicted_);
-        before_ = last;
-    }
-    solve_node(predicted_, reference_, q);
+    solve_node(last, reference_, q);
 }
 
 void PathPlanner::swing(const Transition& t, Path& out) {
@@ -217,7 +212,6 @@ void PathPlanner::swing(const Transition& t, Path& out) {
     problem_.tasks.push_back(reach);
     clearance_ = problem_.clearance;
     near_ends(t);
-    before_.clear();
     std::vector<Contact> moving = t.rolling;
     moving.push_back(t.made);
     const auto node = [&](double share, const std::vector<double>& last, bool halves,

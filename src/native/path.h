@@ -103,7 +103,7 @@ class PathPlanner {
     Holding holding_;
     Problem problem_;
     Solution first_, second_;
-    std::vector<double> tangent_, reference_, clearance_, before_, predicted_;
+    std::vector<double> tangent_, reference_, clearance_;
     std::vector<unsigned char> aloft_, low_;
     struct Eased {
         int pair;
