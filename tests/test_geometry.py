@@ -22,6 +22,7 @@ from clamber.model.scene import Scene
 from clamber.model.world import build_world
 from humanoids import mjcf, urdf
 
+MUJOCO = int(mujoco.__version__.split(".")[0])
 PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = range(7)
 NAMES = [k.name.removeprefix("mjGEOM_").lower() for k in SHAPES]
 ANY_TWO = [
