@@ -185,7 +185,9 @@ def test_distances_are_those_of_mujoco(a, b, rng):
         for gap in (0.4, 0.01, 1e-4, -0.01):
             near = shifted(one, other, gap)
             ours, theirs = asked(one, near).distance, in_mujoco(one, near)
-            assert ours == pytest.approx(theirs, abs=1e-6)
+            # Before 4, MuJoCo's own were off by up to 0.1 mm beside ellipsoids.
+            off = 1e-4 if ELLIPSOID in (a, b) and MUJOCO < 4 else 1e-6
+            assert ours == pytest.approx(theirs, abs=off)
             assert ours * gap > 0.0
 
 
