@@ -99,7 +99,8 @@ double Statics::contact_forces(const ContactPointsView& contacts, const LoadView
                                double (*forces)[3]) {
     const int n = 3 * contacts.n, na = torque.na, rows = 6 + na, edges = contacts.cone_edges;
     if (forces != nullptr) std::fill_n(&forces[0][0], n, 0.0);
-    if (n == 0 || !(load.mass > 0.0)) return 1.0;
+    const double weight = load.mass * GRAVITY;
+    if (n == 0 || !(weight > 0.0 && std::isfinite(weight))) return 1.0;
     // x: forces in contact frames [weights], at their price.
     double* const H = zeroed(H_, n * n);
     double* const c = zeroed(c_, n);
@@ -150,13 +151,20 @@ double Statics::contact_forces(const ContactPointsView& contacts, const LoadView
     solver_.settings.primal_tol = DAQP_DEFAULT_PRIM_TOL;
     if (solver_.solve(qp) <= 0) return 1.0;
     const double* const x = solver_.x();
-    const double weight = load.mass * GRAVITY;
-    if (forces != nullptr)
+    if (forces != nullptr) {
+        bool finite = true;
         for (int i = 0; i < contacts.n; ++i)
-            for (int k = 0; k < 3; ++k)
+            for (int k = 0; k < 3; ++k) {
                 forces[i][k] = weight * (axes[3 * i][k] * x[3 * i] +
                                          axes[3 * i + 1][k] * x[3 * i + 1] +
                                          axes[3 * i + 2][k] * x[3 * i + 2]);
+                finite = finite && std::isfinite(forces[i][k]);
+            }
+        if (!finite) {
+            std::fill_n(&forces[0][0], n, 0.0);
+            return 1.0;
+        }
+    }
     double left = 0.0;
     for (int i = 0; i < rows; ++i) {
         const double over = left_over(qp, i);
