@@ -253,7 +253,7 @@ void Solver::solve(const Problem& problem, const double* q, int iterations,
 
 void Solver::solve_hard(const Problem& problem, const double* q, const double* hint,
                         Solution& out) {
-    solve(problem, hint ? hint : q, 60, 2e-3, out);
+    solve(problem, hint ? hint : q, MAX_ITERATIONS, STEP_TOL, out);
     int iterations = out.iterations;
     // Distances make the problem non-convex: from `q`, a limb may be on the wrong side
     // of an edge. Then from where it stalled, and from the posture that would do if
@@ -269,11 +269,11 @@ void Solver::solve_hard(const Problem& problem, const double* q, const double* h
             Problem free = problem;
             std::fill(free.clearance.begin(), free.clearance.end(),
                       -std::numeric_limits<double>::infinity());
-            solve(free, q, 60, 2e-3, trial);
+            solve(free, q, MAX_ITERATIONS, STEP_TOL, trial);
             iterations += trial.iterations;
             start = trial.q;
         }
-        solve(problem, start.data(), 60, 2e-3, trial);
+        solve(problem, start.data(), MAX_ITERATIONS, STEP_TOL, trial);
         iterations += trial.iterations;
         if (trial.residuals.worst() < out.residuals.worst()) std::swap(out, trial);
     }

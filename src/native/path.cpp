@@ -22,6 +22,14 @@ constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
 constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
 constexpr double COM_WEIGHT = 0.3, ELLIPSE_WEIGHT = 2.0;
 
+// Contacts that stay closed in each phase: shift, swing, settle.
+std::array<std::vector<Contact>, 3> closed_contacts(const Transition& t) {
+    std::array<std::vector<Contact>, 3> out{t.held, t.held, t.held};
+    out[0].insert(out[0].end(), t.rolling.begin(), t.rolling.end());
+    if (t.makes) out[2].push_back(t.made);
+    return out;
+}
+
 }  // namespace
 
 double highest(const Support& s, const Vec3& p1, const Vec3& p2) {
@@ -110,16 +118,10 @@ void PathPlanner::solve_node(const std::vector<double>& from,
                              const std::vector<double>& other, std::vector<double>& q) {
     solver.solve(problem_, from.data(), NODE_ITERATIONS, NODE_STEP, first_);
     if (!first_.residuals.solved()) {
-        solver.solve(problem_, other.data(), 60, 2e-3, second_);
+        solver.solve(problem_, other.data(), MAX_ITERATIONS, STEP_TOL, second_);
         if (second_.residuals.worst() < first_.residuals.worst()) std::swap(first_, second_);
     }
     q = first_.q;
-}
-
-void PathPlanner::bridge_node(const std::vector<double>& near,
-                              const std::vector<double>& other, std::vector<double>& q) {
-    problem_.q_reference = near;
-    solve_node(near, other, q);
 }
 
 void PathPlanner::bridge(const std::vector<double>& a, const std::vector<double>& b,
@@ -134,12 +136,12 @@ void PathPlanner::bridge(const std::vector<double>& a, const std::vector<double>
     std::vector<double> middle;
     const auto node = [&](double share, const std::vector<double>& last, bool halves,
                           std::vector<double>& q) {
-        if (halves) {
-            bridge_node(last, last, q);
-        } else {
+        if (halves)
+            middle = last;
+        else
             between(a, b, share, middle);
-            bridge_node(middle, last, q);
-        }
+        problem_.q_reference = middle;
+        solve_node(middle, last, q);
     };
     fill(a, b, points + 2, contacts, {}, true, node, out);
 }
@@ -177,7 +179,7 @@ void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& contr
     if (!t.adapt) {
         std::fill(problem_.clearance.begin(), problem_.clearance.end(),
                   -std::numeric_limits<double>::infinity());
-        solver.solve(problem_, last.data(), NODE_ITERATIONS, 2e-3, first_);
+        solver.solve(problem_, last.data(), NODE_ITERATIONS, STEP_TOL, first_);
         q = first_.q;
         return;
     }
@@ -248,7 +250,7 @@ void PathPlanner::fill(const std::vector<double>& a, const std::vector<double>& 
             const double share = 0.5 * (nodes[i].share + nodes[i + 1].share);
             const bool inner = ENDS * std::min(share, 1.0 - share) >= 1.0;
             const double depth = overlap(middle.data(), inner ? aloft_ : low_, nullptr);
-            if (drift(nullptr, contacts) > DRIFT_TOL || depth > OVERLAP_TOL) {
+            if (drift(contacts) > DRIFT_TOL || depth > OVERLAP_TOL) {
                 Node next{share, {}};
                 node(share, middle, true, next.q);
                 finer.push_back(std::move(next));
@@ -286,9 +288,8 @@ double PathPlanner::overlap(const double* q, const std::vector<unsigned char>& w
     return deepest;
 }
 
-// Largest distance of a contact from its place; at the present posture without q.
-double PathPlanner::drift(const double* q, const std::vector<Contact>& contacts) {
-    if (q) solver.kin.update(q);
+// Largest distance of a contact from its place, at the posture the kinematics are at.
+double PathPlanner::drift(const std::vector<Contact>& contacts) {
     double out = 0.0;
     for (const Contact& c : contacts) {
         const Vec3& n = model_.supports[c.support].normal;
@@ -319,13 +320,9 @@ void PathPlanner::holding_torques(const std::vector<Contact>& contacts,
 // contacts hold the robot at the postures of a swing, too: those at its ends have been
 // looked at, and while weight shifts more contacts bear.
 void PathPlanner::check(const Transition& t, Path& out) {
-    std::vector<Contact> both = t.held, after = t.held, moving = t.rolling;
-    both.insert(both.end(), t.rolling.begin(), t.rolling.end());
-    if (t.makes) {
-        after.push_back(t.made);
-        moving.push_back(t.made);
-    }
-    const std::vector<Contact>* contacts[3] = {&both, &t.held, &after};
+    const auto contacts = closed_contacts(t);
+    std::vector<Contact> moving = t.rolling;
+    if (t.makes) moving.push_back(t.made);
     out.status = Path::Status::Solved;
     out.depth = 0.0;
     out.pair = -1;
@@ -333,7 +330,7 @@ void PathPlanner::check(const Transition& t, Path& out) {
     std::vector<double> middle;
     for (int k = 0; k < 3; ++k) {
         const Postures& nodes = out.phases[k];
-        watch(*contacts[k], moving, low_);
+        watch(contacts[k], moving, low_);
         for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
             between(nodes[i], nodes[i + 1], 0.5, middle);
             const double* const looked_at[2] = {middle.data(), nodes[i + 1].data()};
@@ -345,7 +342,7 @@ void PathPlanner::check(const Transition& t, Path& out) {
                     out.pair = pair;
                     out.phase = k;
                 }
-                const double open = drift(nullptr, *contacts[k]);
+                const double open = drift(contacts[k]);
                 if (open > DRIFT_LIMIT) {
                     out.status = Path::Status::Opens;
                     out.depth = open;
@@ -435,11 +432,9 @@ void PathPlanner::stances(Transition& t, const double* shifted_hint,
 
 void PathPlanner::plan(const Transition& t, Path& out) {
     swing(t, out);
-    std::vector<Contact> both = t.held, after = t.held;
-    both.insert(both.end(), t.rolling.begin(), t.rolling.end());
-    if (t.makes) after.push_back(t.made);
-    bridge(t.before, t.shifted, both, out.phases[0]);
-    bridge(t.touching, t.after, after, out.phases[2]);
+    const auto contacts = closed_contacts(t);
+    bridge(t.before, t.shifted, contacts[0], out.phases[0]);
+    bridge(t.touching, t.after, contacts[2], out.phases[2]);
     check(t, out);
 }
 

@@ -83,8 +83,6 @@ class PathPlanner {
     void swing(const Transition& t, Path& out);
     void swing_node(const Transition& t, const std::vector<Vec3>& control, double share,
                     const std::vector<double>& last, bool between, std::vector<double>& q);
-    void bridge_node(const std::vector<double>& near, const std::vector<double>& other,
-                     std::vector<double>& q);
     void solve_node(const std::vector<double>& from, const std::vector<double>& other,
                     std::vector<double>& q);
     template <typename Fill>
@@ -94,7 +92,7 @@ class PathPlanner {
     void watch(const std::vector<Contact>& contacts, const std::vector<Contact>& more,
                std::vector<unsigned char>& out) const;
     double overlap(const double* q, const std::vector<unsigned char>& watched, int* pair);
-    double drift(const double* q, const std::vector<Contact>& contacts);
+    double drift(const std::vector<Contact>& contacts);
     void between(const std::vector<double>& a, const std::vector<double>& b, double share,
                  std::vector<double>& out);
     void near_ends(const Transition& t);
