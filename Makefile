@@ -52,7 +52,7 @@ test-mujoco3: $(VENV3)/.can-build ## the tests of `make test` with the last MuJo
 		-c $(VENV3)/constraints.txt 'mujoco<4' -e '.[video,test]'
 	$(VENV3)/bin/python $(PYTEST) -m "$(QUICK) and not ($(OUTSIDE)) and not compare"
 
-fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then tests without a whole plan; what failed last comes first
+fast: $(VENV)/.has-test $(VENV)/.has-dev ## for the edit loop: lint, then tests of less than half a second; what failed last comes first
 	@$(BIN)/ruff check --quiet .
 	$(BIN)/python $(PYTEST) -q -x --failed-first -m "$(QUICK) and not ($(OUTSIDE)) and not compare and not whole"
 

@@ -119,6 +119,7 @@ def test_help_names_every_command_without_loading_the_planner():
     assert all(name in text for name in NAMES)
 
 
+@pytest.mark.whole
 def test_every_command_explains_itself_and_has_json_and_quiet(capsys: Capture):
     for name in NAMES:
         assert cli.main([name, "--help"]) == 0
@@ -134,6 +135,7 @@ def test_version_is_that_of_the_package(capsys: Capture):
         assert capsys.readouterr().out == f"clamber {clamber.__version__}\n"
 
 
+@pytest.mark.whole
 def test_the_process_ends_with_the_exit_code_and_a_reader_may_leave():
     out = subprocess.run([*CLAMBER, "scene", "no.yaml"], capture_output=True, text=True)
     assert out.returncode == output.BAD_INPUT
@@ -533,6 +535,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.whole
 def test_learn_writes_a_policy_that_is_read_again_and_two_pictures(learned: Path):
     policy = clamber.load_policy(learned / "policy.json")
     assert [o.name for o in policy.options] == "ac1 ac2 ac3 ac2 ac1 ac4".split()
@@ -543,6 +546,7 @@ def test_learn_writes_a_policy_that_is_read_again_and_two_pictures(learned: Path
     assert not [p for p in learned.iterdir() if p.name.startswith(".")]
 
 
+@pytest.mark.whole
 def test_learning_again_shows_the_options_and_writes_the_same_bytes(
     learned: Path, capsys: Capture
 ):

@@ -142,6 +142,7 @@ def through_text(codec: Codec, x: Any, kind: Any) -> Any:
 
 
 @given(things)
+@pytest.mark.whole
 def test_a_record_of_every_kind_of_field_survives_to_the_last_bit(thing: Thing):
     assert same(through_text(SMALL, thing, Thing), thing)
 

@@ -189,6 +189,7 @@ def test_runs_that_do_not_set_a_factor_are_in_none_of_its_bins():
     assert {b.share for b in high} == {0.0}
 
 
+@pytest.mark.whole
 def test_tables_and_picture_are_written_alike_each_time(tmp_path: Path):
     spec, rows = swept(friction(), lambda run: run.factors["disturb.friction"] > 0.5)
     files = save_curves(spec, rows, tmp_path)
@@ -229,6 +230,7 @@ def test_every_kind_of_sweep_is_drawn_in_the_colours_of_its_controllers(
         assert np.count_nonzero(off < 20.0) > 20
 
 
+@pytest.mark.whole
 def test_the_picture_shows_the_level_at_which_success_breaks(tmp_path: Path):
     """The curve's descent lies where the axes say, as seen in its pixels."""
 
@@ -247,6 +249,7 @@ def test_the_picture_shows_the_level_at_which_success_breaks(tmp_path: Path):
     assert not math.isnan(step)
 
 
+@pytest.mark.whole
 def test_the_page_of_experiments_tells_what_has_been_run(tmp_path: Path):
     """Two of the experiments, one of them not done yet, with quick jobs."""
     runs, docs = tmp_path / "runs", tmp_path / "docs"

@@ -158,6 +158,7 @@ def test_without_viser_the_pip_command_is_named(
         open_view(tmp_path)
 
 
+@pytest.mark.whole
 def test_help_and_import_do_without_viser():
     code = (
         "import sys, contextlib; from clamber.cli import main\n"

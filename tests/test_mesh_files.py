@@ -281,6 +281,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     deadline=5000,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
+@pytest.mark.whole
 def test_whatever_a_file_holds_it_is_a_mesh_or_our_own_error(tmp_path, name, data):
     good = (GOOD if name == "m.dae" else text_stl()).encode()
     at = sorted(data.draw(st.lists(st.integers(0, len(good)), min_size=2, max_size=6)))
@@ -417,6 +418,7 @@ def test_feet_and_hands_are_found_in_meshes_of_any_form(tmp_path):
     np.testing.assert_allclose(soles[2], soles[0], atol=1e-5)
 
 
+@pytest.mark.whole
 def test_the_library_is_imported_only_where_there_is_such_a_mesh():
     code = "import sys, clamber.model.propose; sys.exit('trimesh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -262,6 +262,7 @@ def test_nearest_points_lie_a_distance_apart_along_the_normal(tilted, seed):
 
 
 @pytest.mark.parametrize("which", ["world", "tilted"])
+@pytest.mark.whole
 def test_normals_are_the_gradients_of_distances(which, request):
     """d' = n' (J_2 - J_1): along a motion, the distance changes by what n predicts."""
     w = request.getfixturevalue(which)

@@ -265,6 +265,7 @@ def test_a_folder_without_a_plan_is_not_drawn(tmp_path: Path):
         pictures.render_run(tmp_path)
 
 
+@pytest.mark.whole
 def test_loading_the_module_changes_no_setting():
     code = "import os, json; a = dict(os.environ); import clamber.show.pictures; "
     code += "print(json.dumps({k: v for k, v in os.environ.items() if a.get(k) != v}))"

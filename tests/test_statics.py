@@ -215,6 +215,7 @@ def test_on_level_ground_forces_and_support_polygon_agree():
 
 
 @pytest.mark.parametrize("edges", [4, 8])
+@pytest.mark.whole
 def test_the_quick_verdict_is_that_of_the_linear_program(edges):
     rng = np.random.default_rng(11)
     verdicts = []
@@ -297,6 +298,7 @@ def test_the_sign_of_the_margin_is_the_quick_verdict():
 
 
 @pytest.mark.parametrize("jointed", [False, True])
+@pytest.mark.whole
 def test_the_margin_is_the_least_push_over_all_directions(jointed):
     """Pushes just within the margin hold in every direction, one beyond it does not."""
     rng = np.random.default_rng(14)

@@ -70,6 +70,7 @@ def test_the_interval_ends_where_the_profile_has_fallen_by_the_quantile(
         assert 2 * (profile(fit.centre) - profile(end)) == pytest.approx(CHI2, abs=1e-3)
 
 
+@pytest.mark.whole
 def test_the_interval_covers_the_truth_about_as_often_as_it_says():
     covered = 0
     for seed in range(120):
@@ -100,6 +101,7 @@ def test_runs_that_all_end_alike_have_no_curve():
     assert fit_break(u, np.zeros(9, bool)) is None
 
 
+@pytest.mark.whole
 def test_a_break_beyond_the_range_is_not_placed_in_it(rng: np.random.Generator):
     u = np.linspace(0.0, 1.0, 300)
     y = rng.uniform(size=300) < special.expit(6.0 * (1.3 - u))

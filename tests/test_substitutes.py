@@ -373,6 +373,7 @@ def test_replan_prints_differences_and_plans_and_nothing_else(
     assert [t["failed"] for t in kept["tried"]] == [0] * 4
 
 
+@pytest.mark.whole
 def test_replan_with_no_stable_plan_exits_with_1(
     failing, demo_sequence, tmp_path, capsys
 ):

@@ -24,6 +24,8 @@ from support.climb import ClimbOptions, synthesize_climb
 from support.crossing import CrossingOptions, synthesize_crossing
 from support.figure import FOREARM, SHANK, THIGH, UPPER_ARM
 
+pytestmark = pytest.mark.whole
+
 SEGMENTS = {
     ("Hip", "Knee"): THIGH, ("Knee", "Foot"): SHANK,
     ("Shoulder", "Elbow"): UPPER_ARM, ("Elbow", "Hand"): FOREARM,
