@@ -128,6 +128,43 @@ std::vector<double> posture(Random& random, const Model& m) {
     return q;
 }
 
+// Most random problems have no answer. Here one has: at a posture within its limits, that of
+// a strong robot whose parts may pass each other, two surfaces lie on supports without end.
+struct Answer {
+    std::vector<double> q;
+    std::vector<Contact> contacts;
+};
+
+Answer with_answer(Random& random, Model& m) {
+    Answer answer{posture(random, m), {}};
+    Quat turned = normalized({answer.q[3], answer.q[4], answer.q[5], answer.q[6]});
+    for (int i = 0; i < 4; ++i) answer.q[3 + i] = (&turned.w)[i];
+    for (std::size_t i = 0; i < m.qadr.size(); ++i) {
+        answer.q[m.qadr[i]] = random.uniform(m.q_min[i], m.q_max[i]);
+        m.tau_max[i] += 1e4;
+    }
+    m.pairs.clear();
+    m.touching.assign(m.surfaces.size(), std::vector<std::array<std::vector<int>, 2>>(2));
+    Kinematics kin(m);
+    kin.update(answer.q.data());
+    for (int k = 0; k < 2 && k < static_cast<int>(m.surfaces.size()); ++k) {
+        const Surface& surface = m.surfaces[k];
+        Support& support = m.supports[k];
+        const Mat3 R = surface.flat ? matrix(kin.quat(surface.body) * surface.rotation)
+                                    : frame_from_normal({0.0, 0.0, 1.0}, {1.0, 0.0, 0.0});
+        support = {{}, R.col(2), R.col(0), R.col(1), 1.0, support.geom, {}, {}};
+        support.position = kin.contact_point(k, -1, support.normal);
+        Contact c;
+        c.surface = c.support = k;
+        c.has_link = !surface.flat;
+        c.position = support.position;
+        c.quaternion = quat_from_matrix(R);
+        c.link = kin.quat(surface.body);
+        answer.contacts.push_back(c);
+    }
+    return answer;
+}
+
 SurfaceTask task(Random& random, const Model& m) {
     SurfaceTask t;
     t.surface = random.below(static_cast<int>(m.surfaces.size()));
@@ -206,9 +243,18 @@ void saw(Outcome& outcome, const Solution& s) {
 }  // namespace
 
 void posture(Random& random, Outcome& outcome) {
-    const Model m = robot(random);
-    const Problem p = question(random, m);
-    const std::vector<double> q = posture(random, m);
+    Model m = robot(random);
+    Problem p = question(random, m);
+    std::vector<double> q = posture(random, m);
+    if (random.mood == Mood::TAME && random.one_in(2)) {
+        const Answer answer = with_answer(random, m);
+        p = Problem{};
+        for (const Contact& c : answer.contacts) p.tasks.push_back(closed_task(m, c));
+        p.q_reference = answer.q;
+        p.posture_weight = random.size(1.0);
+        p.balance = false;
+        for (int i = 0; i < m.nq; ++i) q[i] = answer.q[i] + 0.1 * q[i];
+    }
     Solver solver(m), other(m);
     Solution found, again;
     solver.solve(p, q.data(), 6, 2e-3, found);
@@ -230,7 +276,7 @@ void posture(Random& random, Outcome& outcome) {
 }
 
 void path(Random& random, Outcome& outcome) {
-    const Model m = robot(random);
+    Model m = robot(random);
     Transition t;
     for (auto* q : {&t.before, &t.shifted, &t.touching, &t.after}) *q = posture(random, m);
     // Postures of one motion are near each other.
@@ -243,6 +289,14 @@ void path(Random& random, Outcome& outcome) {
     t.made.edge = -1;
     t.margin = random.number(0.05);
     t.adapt = !random.one_in(4);
+    if (random.mood == Mood::TAME && random.one_in(2)) {
+        const Answer answer = with_answer(random, m);
+        t.before = t.shifted = t.touching = t.after = answer.q;
+        t.held = answer.contacts;
+        t.rolling.clear();
+        t.made = t.held.back();
+        if (t.makes && t.held.size() > 1) t.held.pop_back();
+    }
     Path found;
     PathPlanner(m).plan(t, found);
     outcome.saw(static_cast<int>(found.status));
