@@ -7,7 +7,8 @@ Row i is a box drawn from the generator of seed (SEED, i): length 0.5 to 2.0 m, 
 0.6 to 1.2 m, height 0.20 to 0.31 m, its near face 0.26 m ahead of the robot, which
 starts up to 0.1 m aside in x and y and turned by up to 10 degrees. Rows that the file
 has are not run again, so that the experiment goes on where it was interrupted. With
-`--plan` they are planned alone, with `--keep DIR` each run is kept as a folder.
+`--plan` they are planned alone, with `--keep DIR` each run is kept as a folder. At the
+end stands what the contact changes that were tried took, of CPU time.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from __future__ import annotations
 import argparse
 import csv
 import math
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from bench_plan import timed_changes
 
 import clamber
 from clamber.execution.events import Replanned
@@ -119,15 +120,21 @@ def main() -> None:
             done = {int(r["row"]) for r in csv.DictReader(f)}
     else:
         args.table.write_text(",".join(COLUMNS) + "\n")
-    for row in sorted(set(range(args.rows)) - done):
-        folder = None if args.keep is None else args.keep / f"{row:02d}"
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-        result = cross(policy, robot, row, folder, physics=not args.plan)
-        with args.table.open("a", newline="") as f:
-            csv.DictWriter(f, COLUMNS).writerow(result)
-        sys.stdout.write(f"{result}\n")
-        sys.stdout.flush()
+    with timed_changes() as changes:
+        for row in sorted(set(range(args.rows)) - done):
+            folder = None if args.keep is None else args.keep / f"{row:02d}"
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+            result = cross(policy, robot, row, folder, physics=not args.plan)
+            with args.table.open("a", newline="") as f:
+                csv.DictWriter(f, COLUMNS).writerow(result)
+            print(result, flush=True)
+    if changes:
+        median, high = np.percentile(changes, [50, 99])
+        print(
+            f"{len(changes)} contact changes tried: median {median:.2f} ms,"
+            f" 99 % within {high:.2f} ms, at most {max(changes):.2f} ms"
+        )
 
 
 if __name__ == "__main__":

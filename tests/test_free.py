@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -131,14 +132,15 @@ def test_the_same_search_finds_the_same(found, ik, goal):
 
 def test_what_is_found_does_not_depend_on_the_number_of_threads(ik, goal, monkeypatch):
     """Also in which order it is noted, and why what failed did."""
-    plain, before = Search._aside, standing(ik, PlanOptions().keyframe)
+    plain, before = search_module.change_contact, standing(ik, PlanOptions().keyframe)
     routes, logs, aside = [], [], []
 
-    def count(self, want):
-        aside.append(want)
-        return plain(self, want)
+    def count(*args):
+        if threading.current_thread() is not threading.main_thread():
+            aside.append(args)
+        return plain(*args)
 
-    monkeypatch.setattr(Search, "_aside", count)
+    monkeypatch.setattr(search_module, "change_contact", count)
     for n in (1, 2, 4):
         monkeypatch.setattr(search_module, "threads", lambda n=n: n)
         shared = Search(ik, PlanOptions(), Budget(tries=40))
@@ -157,7 +159,7 @@ def test_what_is_found_does_not_depend_on_the_number_of_threads(ik, goal, monkey
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_process_tries_in_threads_of_its_own():
     def works() -> None:
-        assert search_module._pool(1).submit(len, "ok").result(timeout=10) == 2
+        assert search_module._pool(1, "jobs").submit(len, "ok").result(timeout=10) == 2
 
     works()
     child = multiprocessing.get_context("fork").Process(target=works)

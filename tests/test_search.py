@@ -368,15 +368,18 @@ def test_feet_that_stay_go_on_tiptoe_where_flat_ones_do_not_do(ik, steps, monkey
 class Named:
     """An entry that leads to others; its price may rise."""
 
-    wants = None
+    idle = False
 
     def __init__(self, name, price, ended=False, leads_to=()):
         self.name, self.price, self.ended = name, price, ended
         self.leads_to, self.asked = leads_to, []
 
-    def tried(self):
+    def look(self, search):
         self.asked.append(self.name)
         return self.leads_to
+
+    def after(self, found):
+        return found
 
 
 def test_the_cheapest_comes_first_and_an_end_must_be_the_cheapest_too(ik):
@@ -391,7 +394,15 @@ def test_the_cheapest_comes_first_and_an_end_must_be_the_cheapest_too(ik):
 def test_what_has_become_dearer_while_it_waited_waits_on(ik):
     end, waits = Named("end", 1.5, ended=True), Named("waits", 1.0)
     first = Named("first", 0.0, leads_to=[end])
-    first.tried = lambda: setattr(waits, "price", 2.0) or [end]
+    first.after = lambda _: setattr(waits, "price", 2.0) or [end]
+    assert Search(ik, PlanOptions()).best_first([first, waits])[0] is end
+    assert waits.asked == []
+
+
+def test_what_is_idle_by_now_is_not_looked_at(ik):
+    end, waits = Named("end", 2.0, ended=True), Named("waits", 1.0)
+    first = Named("first", 0.0, leads_to=[end])
+    first.after = lambda _: setattr(waits, "idle", True) or [end]
     assert Search(ik, PlanOptions()).best_first([first, waits])[0] is end
     assert waits.asked == []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,7 @@ from clamber.planning.substitutes import (
 )
 from clamber.run.folder import load_plan, save_plan, save_sequence
 from clamber.step.change import Failure
+from clamber.step.posture import KeyframeOptions
 
 HANDS, ELBOWS = {"LHand", "RHand"}, {"LElbow", "RElbow"}
 
@@ -204,6 +206,39 @@ def test_on_a_low_box_every_alternative_is_shorter_than_the_demonstration(
 def test_the_best_alternative_gets_up_the_low_box(low):
     rollout = simulate(low.best.plan)
     assert judge(low.best.plan, rollout).reached
+
+
+def test_alternatives_do_not_depend_on_the_number_of_threads(
+    demo_sequence, coman, monkeypatch
+):
+    """Nor does what was tried; most of it fails but with some weights."""
+    plain, thought = search.change_contact, planner.VARIATIONS[:4]
+
+    def change(ik, before, step, options, method):
+        threads.add(threading.current_thread().name)
+        stiff = options.reference_weight > KeyframeOptions().reference_weight
+        if step.makes is not None and step.makes.surface == "LKnee" and not stiff:
+            return Failure(status=Status.UNREACHABLE, step=step)
+        return plain(ik, before, step, options, method)
+
+    monkeypatch.setattr(search, "change_contact", change)
+    monkeypatch.setattr(planner, "VARIATIONS", thought)
+    monkeypatch.setattr("clamber.planning.demonstrated.MAX_REPAIRS", 0)
+    found = []
+    for n in (1, 2, 4, 9):
+        threads: set[str] = set()
+        monkeypatch.setattr(search, "threads", lambda n=n: n)
+        found.append(replan(demo_sequence, coman, Scene.from_height(0.2)))
+        assert (len(threads) > 1) is (n > 1)
+    first, *others = found
+    assert [r.stable for r in first.ranked] == [True] * 4
+    assert all(t.failed > 0 for t in first.tried)
+    for other in others:
+        assert other.tried == first.tried
+        for a, b in zip(first.ranked, other.ranked, strict=True):
+            assert (a.surfaces, a.cost) == (b.surfaces, b.cost)
+            for x, y in zip(a.plan.keyframes, b.plan.keyframes, strict=True):
+                assert np.array_equal(x.q, y.q)
 
 
 # Falling back.

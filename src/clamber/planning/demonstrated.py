@@ -9,13 +9,13 @@ from which there may be a way: the first with the fewest steps left out is found
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from clamber.contact.contact import Contact
 from clamber.contact.steps import Seeds, Step
 from clamber.planning.records import PlanOptions, Route
-from clamber.planning.search import Search, Want
+from clamber.planning.search import Search
 from clamber.step.change import Change, Failure
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
@@ -60,7 +60,6 @@ def follow_steps(
     """
     lines = [
         _Line(
-            search=search,
             proposer=proposer,
             options=varied(search.options, factors),
             weights=i,
@@ -98,7 +97,6 @@ class _Line:
         mended: How often earlier contacts were put elsewhere.
     """
 
-    search: Search
     proposer: str
     options: PlanOptions
     weights: int
@@ -121,30 +119,41 @@ class _Line:
         return self.k == len(self.steps)
 
     @property
-    def wants(self) -> Want | None:
-        """The next step."""
-        if self.ended:
-            return None
-        return self.route.end, self.steps[self.k], self.options
+    def idle(self) -> bool:
+        """Never: steps can be left out."""
+        return False
 
     @property
     def route(self) -> Route:
         """How far it has come."""
         return Route(start=self.start, changes=self.changes)
 
-    def tried(self) -> Iterable[_Line]:
+    def look(self, search: Search) -> _Line:
+        """The line where it has ended or become dearer, or time is up."""
+        line = self
+        while line.price == self.price and not line.ended and not search.late:
+            line = line._next(search)
+        return line
+
+    def after(self, found: _Line) -> list[_Line]:
+        """The line as it was found."""
+        return [found]
+
+    def _next(self, search: Search) -> _Line:
         """The line after its next step, or before one that is to be mended."""
         step = self.steps[self.k]
         names = (*(() if self.proposer == "demonstrated" else (self.proposer,)), step)
         note = ": ".join(map(str, names))
-        self.search.report("plan", self.k / len(self.steps), note)
-        found = self._change(self.route.end, step)
-        return [self._after(found) if isinstance(found, Change) else self._mend(found)]
+        search.report("plan", self.k / len(self.steps), note)
+        found = self._change(search, self.route.end, step)
+        if isinstance(found, Change):
+            return self._after(search, found)
+        return self._mend(search, found)
 
-    def _change(self, before: Keyframe, step: Step) -> Change | Failure:
-        return self.search.change(self.proposer, before, step, self.options)
+    def _change(self, search: Search, before: Keyframe, step: Step) -> Change | Failure:
+        return search.change(self.proposer, before, step, self.options)
 
-    def _after(self, change: Change) -> _Line:
+    def _after(self, search: Search, change: Change) -> _Line:
         """With a change more; earlier ones anew where that leaves more room."""
         line = replace(
             self,
@@ -153,14 +162,14 @@ class _Line:
             changes=(*self.changes, change),
         )
         if self.mended < MAX_REPAIRS and change.margin < MARGINS[0]:
-            return line._roomier() or line
+            return line._roomier(search) or line
         return line
 
-    def _mend(self, failure: Failure) -> _Line:
+    def _mend(self, search: Search, failure: Failure) -> _Line:
         """Back at the first contact that is put elsewhere, or the step left out."""
         step, better = self.steps[self.k], None
         if self.mended < MAX_REPAIRS:
-            better = next(repairs(self.search.ik, self.route, step), None)
+            better = next(repairs(search.ik, self.route, step), None)
         if better is None:
             failures = {**self.failures, self.k: failure}
             return replace(self, k=self.k + 1, failures=failures)
@@ -180,7 +189,7 @@ class _Line:
             mended=self.mended + 1,
         )
 
-    def _roomier(self) -> _Line | None:
+    def _roomier(self, search: Search) -> _Line | None:
         """The last step with the largest margin, earlier contacts put elsewhere.
 
         None where that does not help, or costs another step its margin.
@@ -188,7 +197,7 @@ class _Line:
         last = self.steps[self.done[-1]]
         before = replace(self, changes=self.changes[:-1]).route
         least = [*(c.margin for c in before.changes), MARGINS[0]]
-        for places, seeds in repairs(self.search.ik, before, last, margin=MARGINS[0]):
+        for places, seeds in repairs(search.ik, before, last, margin=MARGINS[0]):
             j, steps = min(places), list(self.steps)
             steps[self.done[-1]] = replace(last, seeds=seeds)
             for i, contact in places.items():
@@ -196,7 +205,7 @@ class _Line:
             changes = list(self.changes[:j])
             for i in range(j, len(self.done)):
                 key = changes[-1].keyframe if changes else self.start
-                found = self._change(key, steps[self.done[i]])
+                found = self._change(search, key, steps[self.done[i]])
                 if isinstance(found, Failure) or found.margin < least[i]:
                     break
                 changes.append(found)

@@ -30,8 +30,8 @@ from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.world import World
 from clamber.planning.records import Route
-from clamber.planning.search import Search, Want
-from clamber.step.change import Failure
+from clamber.planning.search import Search
+from clamber.step.change import Change, Failure
 from clamber.step.posture import Keyframe
 from clamber.step.stability import STANDING_SHARE, standing_share
 
@@ -149,22 +149,21 @@ class _Action:
         return self.step is None
 
     @property
-    def wants(self) -> Want | None:
-        """The step, but where its stance has been reached meanwhile."""
-        if self.step is None or self.key in self.free.seen:
-            return None
-        return self.route.end, self.step, self.free.search.options
+    def idle(self) -> bool:
+        """Whether its stance has been reached meanwhile, at less cost."""
+        return self.key in self.free.seen
 
-    def tried(self) -> list[_Action]:
+    def look(self, search: Search) -> Change | Failure:
+        """Try the step."""
+        assert self.step is not None  # it has not ended
+        return search.change("search", self.route.end, self.step)
+
+    def after(self, found: Change | Failure) -> list[_Action]:
         """What may be done after the step, where it is possible."""
-        free, step = self.free, self.step
-        if step is None or self.key in free.seen:  # reached meanwhile, at less cost
-            return []
-        search = free.search
-        n = sum(free.often.values()) + 1
+        free = self.free
         free.often[self.kind] += 1
-        search.report("search", n / search.budget.tries, str(step))
-        found = search.change("search", self.route.end, step)
+        n = sum(free.often.values())
+        free.search.report("search", n / free.search.budget.tries, str(self.step))
         if isinstance(found, Failure):
             return []
         free.seen |= {self.key, _key(found.keyframe.stance)}

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
@@ -47,6 +47,7 @@ from clamber.planning.records import (
 from clamber.planning.search import Search
 from clamber.planning.start import from_here, from_standing, settle, steps_done
 from clamber.planning.substitutes import (
+    Alternative,
     contact_alternatives,
     contact_differences,
     plan_cost,
@@ -260,7 +261,7 @@ class _Task:
         """As demonstrated, or as the policy has it."""
         if isinstance(self._goal, GeneralPolicy):
             return self._followed(self._goal)
-        return self._planned(self._goal)
+        return self._planned(self._search, self._goal)
 
     def timed(self, found: Plan) -> Plan:
         """A plan with its trajectory."""
@@ -289,6 +290,7 @@ class _Task:
 
     def _planned(
         self,
+        search: Search,
         sequence: ContactSequence,
         proposer: str = "demonstrated",
         weights: int | None = None,
@@ -306,9 +308,7 @@ class _Task:
             route = Route(start=self._start, failures=self._unsettled)
             return self._plan(goal, route, state)
         variations = VARIATIONS[:weights]
-        route, used = follow_steps(
-            self._search, self._start, steps, proposer, variations
-        )
+        route, used = follow_steps(search, self._start, steps, proposer, variations)
         found = self._plan(goal, route, state)
         return replace(found, options=used, skipped=tuple(skipped))
 
@@ -370,22 +370,29 @@ class _Task:
     def _others(self, first: Plan | None) -> Iterator[Ranked]:
         sequence, robot = self._goal, self._ik.world.robot
         assert isinstance(sequence, ContactSequence)
-        planned = []
-        for a in contact_alternatives(sequence, robot):
-            found = None if a.surfaces else first
-            name = ", ".join(a.surfaces) or "demonstrated"
-            planned.append(found or self._planned(a.sequence, name))
-            yield _ranked(a.surfaces, "alternatives", planned[-1])
+        others = contact_alternatives(sequence, robot)
+        if first is not None and not others[0].surfaces:
+            planned = [first]  # it is the only one
+        else:
+            planned = self._search.each([self._job(a) for a in others])
+        for a, found in zip(others, planned, strict=True):
+            yield _ranked(a.surfaces, "alternatives", found)
         if any(p.complete for p in planned):
             return
         for a in stand_ins(sequence, robot):
-            name = ", ".join(a.surfaces)
-            planned.append(self._planned(a.sequence, name, 1))
+            planned.append(self._job(a, 1)(self._search))
             yield _ranked(a.surfaces, "alternatives", planned[-1])
             if planned[-1].complete:
                 return
         if self._search.budget.tries > 0:
             yield from self._searched(planned)
+
+    def _job(
+        self, a: Alternative, weights: int | None = None
+    ) -> Callable[[Search], Plan]:
+        """Planning an alternative."""
+        name = ", ".join(a.surfaces) or "demonstrated"
+        return lambda search: self._planned(search, a.sequence, name, weights)
 
     def _searched(self, made: Sequence[Plan]) -> Iterator[Ranked]:
         """What is found from where the farthest plan is stuck, or from the start."""

@@ -1,26 +1,29 @@
 """One search: contact changes are tried, what promises most first, until one arrives.
 
-What may come next is an `Entry`: how far it has come, its price, and what to try for
-more. The cheapest is taken from the queue and tried, and what it leads to is put there.
-What is tried, and with what result, is noted for all searches of a plan together, and
-one budget bounds them.
+What may come next is an `Entry`: its price, and how to find out what comes after it.
+The cheapest is taken from the queue, and what it leads to is put there. What is tried,
+and with what result, is noted for all searches of a plan together, and one budget
+bounds them.
 
-Where one step has failed, what is next in the queue is tried by other threads
-meanwhile: the core leaves the interpreter alone while it solves. What is found, and in
-which order it is noted, does not depend on them.
+Where one step has failed, what is next in the queue is looked at by other threads
+meanwhile, each in a workspace of its own: the core leaves the interpreter alone while
+it solves. So are jobs that do not need one another (`Search.each`). What is found, and
+in which order it is noted, does not depend on them.
 """
 
 from __future__ import annotations
 
+import copy
 import functools
 import heapq
 import itertools
+import math
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import Empty, SimpleQueue
-from typing import Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 from clamber.contact.steps import Step
 from clamber.errors import Status
@@ -35,8 +38,7 @@ from clamber.step.change import Change, Failure, change_contact
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
 
-# A keyframe, a step to try from it, and how.
-Want = tuple[Keyframe, Step, PlanOptions]
+QUEUED = 2  # entries at most that wait for a thread, for each
 
 
 def threads() -> int:
@@ -52,21 +54,20 @@ def threads() -> int:
 
 
 @functools.cache
-def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="clamber")
+def _pool(workers: int, of: str) -> ThreadPoolExecutor:
+    """Threads; what waits for others of a pool must be in another one."""
+    return ThreadPoolExecutor(workers, thread_name_prefix=f"clamber-{of}")
 
 
-# A forked process has a copy of the pool and none of its threads: it would wait.
+# A forked process has a copy of the pools and none of their threads: it would wait.
 os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-class Entry(Protocol):
-    """What may come next in a search."""
+F = TypeVar("F")
 
-    @property
-    def wants(self) -> Want | None:
-        """The step that is tried first, where that is known."""
-        ...
+
+class Entry(Protocol[F]):
+    """What may come next in a search."""
 
     @property
     def price(self) -> float:
@@ -78,12 +79,22 @@ class Entry(Protocol):
         """Nothing is left to be tried: where it is the cheapest, it is found."""
         ...
 
-    def tried(self) -> Iterable[Self]:
-        """Try what comes next; what may come after that."""
+    @property
+    def idle(self) -> bool:
+        """Nothing is to be tried any more: it leads nowhere."""
+        ...
+
+    def look(self, search: Search) -> F:
+        """Try what comes next in a search; others are asked before this, or after."""
+        ...
+
+    def after(self, found: F) -> Iterable[Self]:
+        """What may come after what it has found: asked for in order."""
         ...
 
 
-E = TypeVar("E", bound=Entry)
+E = TypeVar("E", bound=Entry[Any])
+T = TypeVar("T")
 
 
 class Search:
@@ -108,8 +119,7 @@ class Search:
         self.ik, self.options, self.report = ik, options, report
         self.budget = budget or Budget()
         self.attempts: list[Attempt] = []
-        self._others = threads() - 1
-        self._ahead: dict[tuple[int, int, int], tuple[Want, Future]] = {}
+        self._threads = threads()
         self._spare: SimpleQueue[IK] = SimpleQueue()
         seconds = self.budget.seconds
         self._end = None if seconds is None else time.monotonic() + seconds
@@ -127,36 +137,24 @@ class Search:
         options: PlanOptions | None = None,
     ) -> Change | Failure:
         """Try a step that a proposer wants, and note what came of it."""
-        want = before, step, options or self.options
-        _, ahead = self._ahead.pop(_name(want), (want, None))
-        found = _tried(self.ik, want) if ahead is None else ahead.result()
+        how = options or self.options
+        found = change_contact(self.ik, before, step, how.keyframe, how.method)
         failure = found if isinstance(found, Failure) else None
         self.attempts.append(Attempt(proposer=proposer, step=step, failure=failure))
         return found
 
-    def _look_ahead(self, entries: Iterable[Entry]) -> None:
-        """Have other threads try what these want first."""
-        for entry in entries:
-            busy = sum(not f.done() for _, f in self._ahead.values())
-            want = entry.wants
-            if (
-                want is not None
-                and busy < self._others
-                and _name(want) not in self._ahead
-            ):
-                future = _pool(self._others).submit(self._aside, want)
-                self._ahead[_name(want)] = want, future
+    def each(self, jobs: Sequence[Callable[[Search], T]]) -> list[T]:
+        """What jobs find that do not need one another, several at a time.
 
-    def _aside(self, want: Want) -> Change | Failure:
-        """Try a step in another workspace."""
-        try:
-            ik = self._spare.get_nowait()
-        except Empty:
-            ik = IK(self.ik.world, self.ik.extra)
-        try:
-            return _tried(ik, want)
-        finally:
-            self._spare.put(ik)
+        What they try is noted as if one had come after the other.
+        """
+        if self._threads == 1 or len(jobs) < 2:
+            return [job(self) for job in jobs]
+        share = max(1, self._threads // len(jobs))
+        asides = [_Aside(self, job, share) for job in jobs]
+        for aside in asides[1:]:
+            aside.begin("jobs")
+        return [aside.result(asides) for aside in asides]
 
     def best_first(
         self, entries: Iterable[E], most: int | None = None
@@ -170,30 +168,113 @@ class Search:
             most: Attempts; None: as many as it takes.
         """
         queue: list[tuple[float, int, E]] = []
-        order, before = itertools.count(), len(self.attempts)
+        order, before, failed = itertools.count(), len(self.attempts), False
+        ahead: dict[int, _Aside] = {}  # by identity of the entry, which they keep
         for entry in entries:
             heapq.heappush(queue, (entry.price, next(order), entry))
-        while queue:
-            price, _, entry = heapq.heappop(queue)
-            if entry.ended:
-                return entry, None
-            tried = self.attempts[before:]
-            if self.late or (most is not None and len(tried) >= most):
-                return entry, Failure(status=Status.BUDGET)
-            if self._others and any(a.failure for a in tried):
-                ahead = heapq.nsmallest(self._others, queue)
-                self._look_ahead(x for _, _, x in ahead)
-            for x in [entry] if entry.price > price else entry.tried():
-                heapq.heappush(queue, (x.price, next(order), x))
+        try:
+            while queue:
+                price, _, entry = heapq.heappop(queue)
+                if entry.ended:
+                    return entry, None
+                tried = len(self.attempts)
+                if self.late or (most is not None and tried - before >= most):
+                    return entry, Failure(status=Status.BUDGET)
+                if entry.price > price:
+                    heapq.heappush(queue, (entry.price, next(order), entry))
+                    continue
+                if entry.idle:
+                    continue
+                if failed:
+                    self._look_ahead(ahead, queue)
+                aside = ahead.pop(id(entry), None)
+                found = aside.result(ahead.values()) if aside else entry.look(self)
+                failed = failed or any(a.failure for a in self.attempts[tried:])
+                for x in entry.after(found):
+                    heapq.heappush(queue, (x.price, next(order), x))
+        finally:
+            for aside in ahead.values():
+                aside.stop()
         return None, Failure(status=Status.EXHAUSTED)
 
+    def _look_ahead(
+        self, ahead: dict[int, _Aside], queue: list[tuple[float, int, E]]
+    ) -> None:
+        """Have other threads look at the entries that are next."""
+        others = self._threads - 1
+        room = QUEUED * others - sum(not a.done for a in ahead.values())
+        next_ones = heapq.nsmallest(room + len(ahead), queue) if room > 0 else []
+        for _, _, entry in next_ones:
+            if room > 0 and id(entry) not in ahead and not (entry.ended or entry.idle):
+                ahead[id(entry)] = aside = _Aside(self, entry.look, 1)
+                aside.begin("entries")
+                room -= 1
 
-def _name(want: Want) -> tuple[int, int, int]:
-    """The same for the same objects, which whoever asks keeps."""
-    before, step, options = want
-    return id(before), id(step), id(options)
 
+class _Aside:
+    """A job in another thread, in a search of its own, and what it tries there."""
 
-def _tried(ik: IK, want: Want) -> Change | Failure:
-    before, step, options = want
-    return change_contact(ik, before, step, options.keyframe, options.method)
+    def __init__(
+        self, search: Search, job: Callable[[Search], Any], workers: int
+    ) -> None:
+        """Do nothing yet.
+
+        Args:
+            search: Whose budget it has, and where what it tries is noted in the end.
+            job: What is to be done.
+            workers: Threads that it may use itself.
+        """
+        self._search, self._job = search, job
+        self._own = copy.copy(search)
+        self._own.attempts, self._own.report = [], silent
+        self._own._threads = workers
+        self._future: Future | None = None
+
+    def begin(self, of: str) -> None:
+        """Wait for a thread of a pool."""
+        self._future = _pool(threads() - 1, of).submit(self._run)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to be done for it."""
+        return self._future is not None and self._future.done()
+
+    def stop(self) -> None:
+        """Nobody waits for it any more."""
+        self._own._end = -math.inf
+        if self._future is not None:
+            self._future.cancel()
+
+    def result(self, others: Iterable[_Aside]) -> Any:
+        """What it finds; where no thread has begun with it, by this one, at once.
+
+        Args:
+            others: Of which one that waits is done while this one is not ready.
+        """
+        if self._future is None or self._future.cancel():
+            return self._job(self._search)
+        while not self._future.done():
+            helped = next((x for x in others if x._take()), None)
+            if helped is None:
+                break
+            helped._future = Future()
+            helped._future.set_result(helped._run())
+        found = self._future.result()
+        self._search.attempts.extend(self._own.attempts)
+        return found
+
+    def _take(self) -> bool:
+        """Whether it was waiting for a thread, and is no more."""
+        future = self._future
+        return future is not None and not future.done() and future.cancel()
+
+    def _run(self) -> Any:
+        own = self._own
+        try:
+            own.ik = own._spare.get_nowait()
+        except Empty:
+            own.ik = IK(own.ik.world, own.ik.extra)
+        try:
+            return self._job(own)
+        finally:
+            own._spare.put(own.ik)
