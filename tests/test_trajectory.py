@@ -388,5 +388,5 @@ def test_a_fast_motion_is_slowed_down_until_inertia_leaves_it_balanced(
     margin = lowest_dynamic_margin(demo_kinematics, world, first, 2.0)
     assert margin > 0.0
     unlimited = "clamber.planning.trajectory._balanced_cruise"
-    monkeypatch.setattr(unlimited, lambda kin, phase, curve, length, cruise: cruise)
+    monkeypatch.setattr(unlimited, lambda kin, phase, spline, cruise: cruise)
     assert lowest_dynamic_margin(demo_kinematics, world, first, 2.0) < -0.01 < margin

@@ -304,8 +304,12 @@ class Loop:
         tilt: float,
         height: float,
         push: np.ndarray | None,
+        steps: int,
     ) -> None:
-        """Actuators of the joints; the last `tail` steps are recorded one by one."""
+        """Actuators of the joints; the last `tail` steps are recorded one by one.
+
+        Memory is laid by for as many `steps`; there may be more.
+        """
 
     def step(self, owner: object) -> bool:
         """All that is due before the next `mj_step`; False where there is none."""
@@ -353,8 +357,17 @@ _Solution = tuple[np.ndarray, int, bool, _Residuals]
 # Status, phase, depth or opening, pair, the posture that cannot be held.
 _Verdict = tuple[int, int, float, int, np.ndarray]
 
-def on_manifold(raw: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Postures (n, nq), tangent vectors (n, nv) of raw coordinates and their slopes."""
+def along_spline(
+    c: np.ndarray, nodes: np.ndarray, s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Postures (n, nq), tangent vectors (n, nv) along a cubic spline at s (n,).
+
+    Of the raw coordinates, c (4, k - 1, nq) as SciPy's `PPoly` has them between nodes
+    (k,); rotations are normalised. The end pieces go on beyond the nodes.
+    """
+
+def between_rows(rows: np.ndarray, nodes: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """(n, m) at s (n,), linear between rows (k, m); beyond the nodes the end ones."""
 
 def lean_direction(p1: np.ndarray, p2: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
     """Unit vector from a new contact to the mass it will support (4.26, 4.27)."""

@@ -198,18 +198,33 @@ void bind_posture(nb::module_& m) {
     m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);
     m.attr("PATH_OVERLAPS") = static_cast<int>(Path::Status::Overlaps);
     m.attr("PATH_WEAK") = static_cast<int>(Path::Status::Weak);
-    m.def("on_manifold",
-          [](const Array2<>& raw, const Array2<>& slope) {
-              const std::size_t n = raw.shape(0), nq = raw.shape(1);
-              check_size(slope.size(), raw.size(), "slope");
+    m.def("along_spline",
+          [](const Array3<>& c, const Array1<>& nodes, const Array1<>& s) {
+              const std::size_t n = s.size(), nq = c.shape(2);
               if (nq < 7) throw std::invalid_argument("q begins with a free joint");
-              std::vector<double> q(raw.data(), raw.data() + n * nq), v(n * (nq - 1));
-              for (std::size_t i = 0; i < n; ++i)
-                  on_manifold(slope.data() + i * nq, nq, q.data() + i * nq,
-                              v.data() + i * (nq - 1));
+              if (nodes.size() < 2 || c.shape(0) != 4 || c.shape(1) + 1 != nodes.size())
+                  throw std::invalid_argument("four coefficients between two nodes each");
+              std::vector<double> q(n * nq), v(n * (nq - 1)), slope(nq);
+              for (std::size_t i = 0; i < n; ++i) {
+                  double* const at = q.data() + i * nq;
+                  along_spline(c.data(), nodes.data(), nodes.size(), nq, s(i), at, slope.data());
+                  on_manifold(slope.data(), nq, at, v.data() + i * (nq - 1));
+              }
               return nb::make_tuple(own(std::move(q), {n, nq}), own(std::move(v), {n, nq - 1}));
           },
-          "Postures (n, nq) and tangent vectors (n, nv) of raw coordinates and their slopes.");
+          "Postures (n, nq) and tangent vectors (n, nv) along a cubic spline at s (n,).");
+    m.def("between_rows",
+          [](const Array2<>& rows, const Array1<>& nodes, const Array1<>& s) {
+              const std::size_t n = s.size(), width = rows.shape(1);
+              check_size(rows.shape(0), nodes.size(), "a row for each node");
+              if (nodes.size() < 1) throw std::invalid_argument("a node");
+              std::vector<double> out(n * width);
+              for (std::size_t i = 0; i < n; ++i)
+                  between_rows(rows.data(), nodes.data(), nodes.size(), width, s(i),
+                               out.data() + i * width);
+              return own(std::move(out), {n, width});
+          },
+          "Rows (n, k) at s (n,), linear between those of the nodes.");
     m.def("lean_direction",
           [](const Array1<>& p1, const Array1<>& p2, const Array2<>& R_WB) {
               check_size(p1.size() + p2.size() + R_WB.size(), 15, "points and rotation");

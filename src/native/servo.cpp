@@ -202,9 +202,6 @@ bool Balance::feed_back(const Seen& now, const Seen& planned) {
 
 namespace {
 
-template <typename T, int N>
-using View = nb::ndarray<const T, nb::ndim<N>, nb::device::cpu>;
-
 using In = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using InBool = nb::ndarray<const bool, nb::c_contig, nb::device::cpu>;
 
@@ -328,36 +325,67 @@ bool has_fallen(const double* q, const double* reference, double tilt, double he
     return along < std::cos(tilt) || q[2] < reference[2] - height;
 }
 
-// The contacts of an `MjData`, by the names of MuJoCo's Python package. Its arrays are
-// views of memory that lives as long as the data.
+// Where an array of numpy's lies. Quicker than a cast, which asks it first whether it is one
+// of somebody else's.
+template <typename T>
+const T* data_of(nb::handle array, std::ptrdiff_t* stride = nullptr) {
+    Py_buffer b;
+    if (PyObject_GetBuffer(array.ptr(), &b, PyBUF_STRIDES) != 0) throw nb::python_error();
+    const auto* out = static_cast<const T*>(b.buf);
+    const bool fits = b.itemsize == sizeof(T);
+    if (stride) *stride = b.strides[0] / std::ptrdiff_t(sizeof(T));
+    PyBuffer_Release(&b);
+    want(fits, "an array of other numbers");
+    return out;
+}
+
+// The contacts of an `MjData`, by the names of MuJoCo's Python package. They begin its
+// arena, which stays where it is as long as the data: `deepest`, which is asked for after
+// every step, looks up how many there are, and where they lie only as often as `all` does.
+// An array of one says nothing of the distance between two, and an empty one not where it is.
 struct ListedContacts {
     explicit ListedContacts(nb::handle data)
         : data(nb::borrow(data)), contact(data.attr("contact")) {}
 
-    double deepest() const {
-        const auto dist = nb::cast<View<double, 1>>(nb::getattr(contact, dist_name));
+    double deepest() {
+        const int n = count();
+        if (n > 0 && known < 2) find_dist(n);
         double out = 0.0;
-        for (size_t i = 0; i < dist.shape(0); ++i) out = std::max(out, -dist(i));
+        for (int i = 0; i < n; ++i) out = std::max(out, -dist[i * dist_stride]);
         return out;
     }
-    Contacts all() const {
-        const auto geom = nb::cast<View<int, 2>>(contact.attr("geom"));
-        const auto address = nb::cast<View<int, 1>>(contact.attr("efc_address"));
-        const auto frame = nb::cast<View<double, 2>>(contact.attr("frame"));
-        const auto force = nb::cast<View<double, 1>>(data.attr("efc_force"));
-        return {int(geom.shape(0)), geom.data(),      address.data(),   frame.data(),
-                force.data(),       geom.stride(0), address.stride(0), frame.stride(0)};
+    Contacts all() {
+        Contacts c;
+        c.count = count();
+        find_dist(c.count);
+        c.geom = data_of<int>(nb::getattr(contact, geom_name), &c.geom_stride);
+        c.address = data_of<int>(nb::getattr(contact, address_name), &c.address_stride);
+        c.frame = data_of<double>(nb::getattr(contact, frame_name), &c.frame_stride);
+        c.force = data_of<double>(nb::getattr(data, force_name));
+        return c;
     }
+    void find_dist(int n) {
+        known = n;
+        dist = data_of<double>(nb::getattr(contact, dist_name), &dist_stride);
+    }
+    int count() const { return nb::cast<int>(nb::getattr(data, count_name)); }
 
     nb::object data, contact;
-    nb::object dist_name = nb::str("dist");
+    // Interned: that is what the interpreter finds quickly.
+    static nb::object name(const char* of) { return nb::steal(PyUnicode_InternFromString(of)); }
+    nb::object count_name = name("ncon"), dist_name = name("dist"), geom_name = name("geom"),
+               address_name = name("efc_address"), frame_name = name("frame"),
+               force_name = name("efc_force");
+    int known = 0;  // how many there were when `dist` was looked up
+    const double* dist = nullptr;
+    std::ptrdiff_t dist_stride = 0;
 };
 
 // The steps of one simulation: all but `mj_step` itself, and what is recorded.
 struct Loop {
     Loop(nb::handle data, Follower& follower, Sensors& sensors, ContactForces& forces,
          std::vector<int> order, double step_size, int base, int stride, int tail, double tilt,
-         double height, std::optional<In> push)
+         double height, std::optional<In> push, int steps)
         : follower(follower), sensors(sensors), forces(forces), listed(data),
           order(std::move(order)), step_size(step_size), base(base), stride(stride), tail(tail),
           tilt(tilt), height(height), push(std::move(push)) {
@@ -366,6 +394,12 @@ struct Loop {
         };
         qpos = numbers("qpos"), qvel = numbers("qvel"), ctrl = numbers("ctrl");
         effort = numbers("actuator_force"), applied = numbers("xfrc_applied");
+        const size_t n = std::max(steps, 0), rows = n / stride + 1;
+        follower.commanded.reserve(n * follower.track.q.size());
+        states.ctrl.reserve(n * ctrl.size());
+        states.qpos.reserve(rows * qpos.size());
+        states.qvel.reserve(rows * qvel.size());
+        states.effort.reserve(rows * effort.size());
     }
 
     // What is due before the next `mj_step`; false where there is none.
@@ -441,7 +475,9 @@ struct Loop {
     using Numbers = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
     // What is recorded has single precision.
     static void append(Reals& to, const Numbers& x) {
-        for (size_t i = 0; i < x.size(); ++i) to.push_back(double(float(x.data()[i])));
+        const size_t n = to.size();
+        to.resize(n + x.size());
+        for (size_t i = 0; i < x.size(); ++i) to[n + i] = double(float(x.data()[i]));
     }
 
     Follower& follower;
@@ -602,12 +638,12 @@ void bind_servo(nb::module_& m) {
         });
     nb::class_<Loop>(m, "Loop")
         .def(nb::init<nb::handle, Follower&, Sensors&, ContactForces&, std::vector<int>, double,
-                      int, int, int, double, double, std::optional<In>>(),
+                      int, int, int, double, double, std::optional<In>, int>(),
              nb::arg("data"), nb::arg("follower"), nb::arg("sensors"), nb::arg("forces"),
-           nb::kw_only(), nb::arg("order"), nb::arg("step_size"), nb::arg("base"),
+             nb::kw_only(), nb::arg("order"), nb::arg("step_size"), nb::arg("base"),
              nb::arg("stride"), nb::arg("tail"),
-           nb::arg("tilt"), nb::arg("height"), nb::arg("push").none(), nb::keep_alive<1, 3>(),
-           nb::keep_alive<1, 4>(), nb::keep_alive<1, 5>())
+             nb::arg("tilt"), nb::arg("height"), nb::arg("push").none(), nb::arg("steps"),
+             nb::keep_alive<1, 3>(), nb::keep_alive<1, 4>(), nb::keep_alive<1, 5>())
         .def("step", &Loop::step)
         .def("recorded", &Loop::recorded)
         .def_ro("count", &Loop::count)

@@ -15,7 +15,8 @@ import numpy as np
 from clamber import _core
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP, World
-from clamber.planning.trajectory import Samples, Trajectory
+from clamber.planning.samples import Samples
+from clamber.planning.trajectory import Trajectory
 
 BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again

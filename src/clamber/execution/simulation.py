@@ -28,6 +28,7 @@ from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
 
 STRIDE = 10  # physics steps between two recorded states
+AHEAD = 10.0  # [s] longer than planned that memory is laid by for
 END = 1.0  # [s] at the end that every step of is recorded
 FALLEN_TILT = float(np.radians(45.0))  # pelvis against its reference: it has fallen
 FALLEN_HEIGHT = 0.20  # [m]
@@ -146,6 +147,7 @@ def simulate(
         tilt=FALLEN_TILT,
         height=FALLEN_HEIGHT,
         push=push,
+        steps=len(plan.trajectory.time) + round(AHEAD / PHYSICS_STEP),
     )
     runs = True
     while runs:

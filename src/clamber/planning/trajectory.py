@@ -2,9 +2,9 @@
 
 Each phase is a cubic spline through its postures, at rest at both ends, parametrised by
 the largest joint angle travelled; time runs along it under a velocity profile that
-accelerates, cruises at the speed limit and brakes. The base's rotation is the
-normalised spline of its quaternion, so that the angular velocity is its derivative on
-the manifold.
+accelerates, cruises at the speed limit and brakes (`samples`). The base's rotation is
+the normalised spline of its quaternion, so that the angular velocity is its derivative
+on the manifold.
 
 Feed-forward torques balance gravity with the contact forces of least norm at every
 posture, those of leaving contacts ever dearer, and are interpolated along the spline.
@@ -12,20 +12,29 @@ posture, those of leaving contacts ever dearer, and are interpolated along the s
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.se3 import quat_conjugate, quat_multiply
 from clamber.model.world import World
+from clamber.planning.samples import (
+    ACCELERATION,
+    RATE,
+    Run,
+    Samples,
+    Spline,
+    profile,
+    profile_samples,
+    sampled,
+    spline_through,
+)
 from clamber.planning.timing import GRID, demand_at, least_torques, retime
 from clamber.step.change import Change
 from clamber.step.path import Phase
@@ -34,13 +43,10 @@ from clamber.step.stability import contact_points
 from clamber.step.statics import GRAVITY
 from clamber.step.tasks import packed_contacts
 
-RATE = 1000.0  # [Hz]
 REST = 0.10  # [s] at rest between two phases
 TOUCH_REST, MIN_REST = 0.08, 0.02  # [s] ... of a fast motion: after a touch, elsewhere
 HOLD_START = 0.3  # [s]
 HOLD_END = 2.0  # [s] the last posture is held
-ACCELERATION = 4.0  # [1/s] the cruise speed is reached after a quarter of a second
-MIN_PHASE = 0.2  # [s]
 BASE_LENGTH = 0.3  # [m] of base translation count as one radian
 INERTIA_SHARE = 0.6  # of the balance margin that inertia may use up
 BALANCE_SAMPLES = 24  # of the centre of mass along a phase
@@ -49,112 +55,6 @@ SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how ma
 LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
 TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
 SAMPLES = 24  # per gap between two postures, to find the largest speed
-
-
-Sampling = Callable[[int], Sequence[np.ndarray]]
-
-
-class Samples:
-    """(T, n) rows that are sampled when they are asked for, block after block.
-
-    Indexed as an array is, by rows and then by columns; `np.asarray` gives all of it.
-    The last block is kept, so that neighbouring rows cost no more than those of an
-    array: a reference of 1000 samples a second takes no memory.
-    """
-
-    def __init__(
-        self,
-        sample: Sampling,
-        which: int,
-        ends: np.ndarray,
-        n: int,
-        runs: tuple[Run, ...] = (),
-    ) -> None:
-        """Rows of one of the arrays (m, n) that `sample` gives for each block.
-
-        Args:
-            sample: By the number of the block; called again where it was left.
-            which: Of its arrays.
-            ends: (B,) the row at which each block ends.
-            n: Columns.
-            runs: That are sampled.
-        """
-        self.runs = runs
-        self.shape = int(ends[-1]), n
-        self._sample, self._which, self._ends = sample, which, ends
-        # From which row on, and the rows: one value, for who reads in several threads.
-        self._held = 0, np.zeros((0, n))
-
-    def __len__(self) -> int:
-        """T."""
-        return self.shape[0]
-
-    def __getitem__(self, key: Any) -> np.ndarray:
-        """Rows, and columns of them where there are two indices."""
-        rows, *columns = key if isinstance(key, tuple) else (key,)
-        if isinstance(rows, (int, np.integer)):
-            k = range(len(self))[rows]
-            start, block = self._held
-            if not start <= k < start + len(block):
-                start, block = self._look(np.searchsorted(self._ends, k, side="right"))
-            return block[(k - start, *columns)]
-        if isinstance(rows, slice) and rows.step in (None, 1):
-            return self._stretch(*rows.indices(len(self))[:2])[(slice(None), *columns)]
-        index = np.arange(len(self))[rows]
-        out = np.empty((index.size, self.shape[1]))
-        number = np.searchsorted(self._ends, index.ravel(), side="right")
-        for i in np.unique(number):
-            mine = number == i
-            start, block = self._look(i)
-            out[mine] = block[index.ravel()[mine] - start]
-        all_ = slice(None), np.arange(index.size).reshape(index.shape)
-        return out[(all_[not isinstance(rows, slice)], *columns)]
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        """Row after row."""
-        for block in self.blocks():
-            yield from block
-
-    def __array__(
-        self, dtype: np.dtype | None = None, copy: bool | None = None
-    ) -> np.ndarray:
-        """All rows."""
-        return np.concatenate(list(self.blocks())).astype(dtype, copy=False)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled as the array of all rows."""
-        return np.asarray, (np.asarray(self),)
-
-    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Samples:
-        """The rows (m, n) of each block as a function changes them."""
-
-        def sample(i: int) -> tuple[np.ndarray]:
-            return (change(self._look(i)[1]),)
-
-        return Samples(sample, 0, self._ends, self.shape[1])
-
-    def blocks(self) -> Iterator[np.ndarray]:
-        """(m, n) the rows of one block after the other."""
-        for i in range(len(self._ends)):
-            yield self._look(i)[1]
-
-    def _stretch(self, begin: int, end: int) -> np.ndarray:
-        """Rows `begin` to `end`, without the latter: of one block as they are."""
-        out, i = [], int(np.searchsorted(self._ends, begin, side="right"))
-        while begin < end:
-            start, block = self._look(i)
-            out.append(block[begin - start : end - start])
-            begin, i = start + len(block), i + 1
-        return (
-            out[0]
-            if len(out) == 1
-            else np.concatenate([np.zeros((0, self.shape[1])), *out])
-        )
-
-    def _look(self, i: int | np.integer) -> tuple[int, np.ndarray]:
-        block = self._sample(int(i))[self._which]
-        self._held = int(self._ends[i]) - len(block), block
-        return self._held
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -296,53 +196,19 @@ def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
     return np.cumsum([0.0, *np.maximum(ways.max(axis=1), 1e-6)])
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Spline:
-    """One phase as a function of its path parameter."""
-
-    curve: CubicSpline
-    postures: np.ndarray  # (n, nq) that it goes through
-    nodes: np.ndarray  # (n,) of the path parameter
-    held: np.ndarray  # (n, na) torques there
-    cruise: float  # ds/dt at which the fastest joint has the speed limit
-
-    @property
-    def length(self) -> float:
-        """Path parameter at the end."""
-        return float(self.nodes[-1])
-
-    def tau(self, s: np.ndarray) -> np.ndarray:
-        """(T, na) torques, in equal steps between two nodes."""
-        return np.stack([np.interp(s, self.nodes, x) for x in self.held.T], axis=1)
-
-    def sample(self, s: np.ndarray, sdot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        raw, slope = self.curve(s), self.curve(s, 1)
-        q, v = _core.on_manifold(raw, slope)
-        return q, v * sdot[:, None]
-
-
-def _through(
-    s: np.ndarray, postures: np.ndarray, held: np.ndarray, cruise: float
-) -> _Spline:
-    ends = "natural" if len(s) > 2 else "not-a-knot"
-    return _Spline(CubicSpline(s, postures, bc_type=ends), postures, s, held, cruise)
-
-
-def _spline(kin: Kinematics, phase: Phase, speed: float) -> _Spline:
+def _spline(kin: Kinematics, phase: Phase, speed: float) -> Spline:
     nodes = phase.q.copy()
     for k in range(1, len(nodes)):
         if nodes[k, 3:7] @ nodes[k - 1, 3:7] < 0:
             nodes[k, 3:7] *= -1
     s = _arclength(kin, nodes)
-    spline = _through(s, nodes, phase_torques(kin, phase), np.inf)
-    curve = spline.curve
-    fine = np.linspace(0.0, s[-1], SAMPLES * len(nodes))
-    _, slope = _core.on_manifold(curve(fine), curve(fine, 1))
+    spline = spline_through(s, nodes, phase_torques(kin, phase), np.inf)
+    _, slope = spline.along(np.linspace(0.0, s[-1], SAMPLES * len(nodes)))
     slope = np.abs(slope)
     slope[:, :3] /= BASE_LENGTH
     cruise = float((speed / np.maximum(slope.max(axis=0), 1e-9)).min())
     if np.isfinite(cruise):
-        cruise = _balanced_cruise(kin, phase, curve, float(s[-1]), cruise)
+        cruise = _balanced_cruise(kin, phase, spline, cruise)
     return replace(spline, cruise=cruise)
 
 
@@ -364,15 +230,16 @@ def zero_moment_point(
 
 
 def _balanced_cruise(
-    kin: Kinematics, phase: Phase, curve: CubicSpline, length: float, cruise: float
+    kin: Kinematics, phase: Phase, spline: Spline, cruise: float
 ) -> float:
     """The cruise speed, reduced until inertia leaves the robot its balance.
 
     The zero-moment point may use up `INERTIA_SHARE` of the distance that the centre of
     mass has to the border of the support polygon.
     """
+    length = spline.length
     fine = np.linspace(0.0, length, BALANCE_SAMPLES)
-    q = _core.on_manifold(curve(fine), curve(fine, 1))[0]
+    q, _ = spline.along(fine)
     com = kin.core.centres_of_mass(q)
     kin.update(q[-1])
     points = contact_points(kin, phase.contacts).points
@@ -392,7 +259,7 @@ def _balanced_cruise(
         return cruise
     path = CubicSpline(fine, com)
     for _ in range(MAX_SLOWINGS):
-        s, rate = _profile(length, cruise, BALANCE_STRIDE).T
+        s, rate = profile(length, cruise, BALANCE_STRIDE)
         change = np.gradient(rate, BALANCE_STRIDE / RATE)
         acceleration = path(s, 2) * rate[:, None] ** 2 + path(s, 1) * change[:, None]
         p = zero_moment_point(path(s), acceleration, low)
@@ -401,44 +268,6 @@ def _balanced_cruise(
             break
         cruise *= SLOWING
     return cruise
-
-
-def _samples(length: float, cruise: float) -> int:
-    """How many samples a `_profile` has."""
-    ramp = 1.5 / ACCELERATION
-    cruise = min(cruise, length / ramp)
-    return int(np.ceil(max(length / cruise + ramp, MIN_PHASE, 2 * ramp) * RATE))
-
-
-def _profile(length: float, cruise: float, stride: int = 1) -> np.ndarray:
-    """(n, 2) s and ds/dt at 1 kHz: smooth rise to the cruise speed, smooth fall.
-
-    The rise is a raised cosine, so that acceleration has no jumps.
-    """
-    n, ramp = _samples(length, cruise), 1.5 / ACCELERATION
-    total = n / RATE  # a whole number of samples, else ds/dt is not the derivative
-    t = np.arange(1, n + 1, stride) / RATE
-
-    def rise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = np.clip(x, 0.0, ramp)
-        return (
-            0.5 * (x - ramp / np.pi * np.sin(np.pi * x / ramp)),
-            0.5 * (1 - np.cos(np.pi * x / ramp)),
-        )
-
-    up, up_rate = rise(t)
-    down, down_rate = rise(total - t)
-    plateau = max(total - 2 * ramp, 0.0)
-    s = np.where(
-        t <= ramp,
-        up,
-        np.where(t <= ramp + plateau, 0.5 * ramp + (t - ramp), ramp + plateau - down),
-    )
-    rate = np.where(t <= ramp, up_rate, np.where(t <= ramp + plateau, 1.0, down_rate))
-    scale = length / (ramp + plateau)
-    out = np.stack([s * scale, rate * scale], axis=1)
-    out.setflags(write=False)
-    return out
 
 
 def _made(phases: Sequence[Phase], i: int) -> Contact | None:
@@ -451,18 +280,17 @@ def _made(phases: Sequence[Phase], i: int) -> Contact | None:
 
 
 def _fastest(
-    kin: Kinematics, phase: Phase, spline: _Spline, made: Contact | None
+    kin: Kinematics, phase: Phase, spline: Spline, made: Contact | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """s, ds/dt (n,) and torques (n, na) of the fastest motion along a phase."""
     grid = np.linspace(0.0, spline.length, GRID)
-    q, slope = _core.on_manifold(spline.curve(grid), spline.curve(grid, 1))
+    q, slope = spline.along(grid)
     s, rate = retime(
         kin, grid, q, slope, _bend(spline.curve, grid), phase.contacts, made
     )
     change = np.gradient(rate, 1.0 / RATE) if len(rate) > 1 else np.zeros(1)
     look = np.unique([*range(0, len(s), TORQUE_STRIDE), len(s) - 1])
-    raw = spline.curve(s[look])
-    q, slope = _core.on_manifold(raw, spline.curve(s[look], 1))
+    q, slope = spline.along(s[look])
     bend = _bend(spline.curve, s[look])
     tau = []
     every, price_of = handed_over(phase, s[look] / spline.length)
@@ -525,25 +353,6 @@ def build_trajectory(
     )
 
 
-def sampled(runs: Sequence[Run]) -> dict[str, Samples]:
-    """`q`, `v` and `tau` of a trajectory, which are sampled when they are asked for."""
-    runs, stops = tuple(runs), np.cumsum([x.samples for x in runs])
-
-    @functools.lru_cache(maxsize=1)
-    def moving(i: int) -> tuple[np.ndarray, np.ndarray]:
-        return runs[i].motion()
-
-    def pushing(i: int) -> tuple[np.ndarray]:
-        return (runs[i].torques(),)
-
-    postures, torques = runs[0].spline.postures, runs[0].spline.held
-    return {
-        "q": Samples(moving, 0, stops, postures.shape[1], runs),
-        "v": Samples(moving, 1, stops, postures.shape[1] - 1, runs),
-        "tau": Samples(pushing, 0, stops, torques.shape[1], runs),
-    }
-
-
 def timed(
     world: World,
     changes: Sequence[Change],
@@ -590,54 +399,6 @@ def _segments(
     return tuple(out)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Run:
-    """One phase in time, with samples of rest before and after it.
-
-    How far along the path it is and how fast, (2, n), and the torques (n, na) are kept
-    where they are not those of the profile and of the spline.
-    """
-
-    spline: _Spline
-    n: int
-    timing: np.ndarray | None
-    tau: np.ndarray | None
-    lead: int
-    rest: int
-
-    @property
-    def samples(self) -> int:
-        """How many, rest included."""
-        return self.lead + self.n + self.rest
-
-    def motion(self) -> tuple[np.ndarray, np.ndarray]:
-        """Configurations and velocities, rest included."""
-        s, rate = self._timing()
-        q, v = self.spline.sample(s, rate)
-        if self.lead:
-            first, _ = self.spline.sample(np.zeros(1), np.zeros(1))
-            q = np.concatenate([np.repeat(first, self.lead, axis=0), q])
-        still = np.zeros((self.lead, v.shape[1])), np.zeros((self.rest, v.shape[1]))
-        q = np.concatenate([q, np.repeat(q[-1:], self.rest, axis=0)])
-        v = np.concatenate([still[0], v, still[1]])
-        q.setflags(write=False)
-        v.setflags(write=False)
-        return q, v
-
-    def torques(self) -> np.ndarray:
-        """Feed-forward torques, rest included."""
-        tau = self.spline.tau(self._timing()[0]) if self.tau is None else self.tau
-        first = np.repeat(self.spline.tau(np.zeros(1)), self.lead, axis=0)
-        tau = np.concatenate([first, tau, np.repeat(tau[-1:], self.rest, axis=0)])
-        tau.setflags(write=False)
-        return tau
-
-    def _timing(self) -> np.ndarray:
-        if self.timing is not None:
-            return self.timing
-        return _profile(self.spline.length, self.spline.cruise).T
-
-
 def _run(
     kin: Kinematics,
     phases: Sequence[Phase],
@@ -658,62 +419,8 @@ def _run(
         timing, n = np.stack([s, rate]), len(s)
         rest = TOUCH_REST if made else MIN_REST
     else:
-        n, rest = _samples(spline.length, spline.cruise), REST
+        n, rest = profile_samples(spline.length, spline.cruise), REST
     if i == len(phases) - 1:
         rest = HOLD_END
     lead = 0 if i else round(HOLD_START * RATE)
     return Run(spline, n, timing, torque, lead, round(rest * RATE))
-
-
-def runs_as_arrays(trajectory: Trajectory) -> dict[str, np.ndarray] | None:
-    """What a planned trajectory is sampled from; None where it is not.
-
-    Of R runs: `run_sizes` (R, 4) of each its nodes, the samples of its own timing, and
-    those of rest before and after it; `run_cruise` (R,) ds/dt at the largest speed. Of
-    all their N nodes: `node_s` (N,), `node_qpos` (N, nq), `node_tau` (N, na). Of the M
-    samples of their own timing: `timed_s` (M, 2) s and ds/dt, `timed_tau` (M, na).
-    """
-    runs = getattr(trajectory.q, "runs", ())
-    for x in (trajectory.v, trajectory.tau):
-        if not runs or getattr(x, "runs", ()) is not runs:
-            return None
-    splines, na = [x.spline for x in runs], runs[0].spline.held.shape[1]
-    timing, tau = [np.zeros((0, 2))], [np.zeros((0, na))]
-    for x in runs:
-        if x.timing is not None and x.tau is not None:
-            timing.append(x.timing.T)
-            tau.append(x.tau)
-    sizes = [
-        (len(x.spline.nodes), x.n if x.timing is not None else 0, x.lead, x.rest)
-        for x in runs
-    ]
-    return {
-        "run_sizes": np.array(sizes),
-        "run_cruise": np.array([x.cruise for x in splines]),
-        "node_s": np.concatenate([x.nodes for x in splines]),
-        "node_qpos": np.concatenate([x.postures for x in splines]),
-        "node_tau": np.concatenate([x.held for x in splines]),
-        "timed_s": np.concatenate(timing),
-        "timed_tau": np.concatenate(tau),
-    }
-
-
-def runs_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[Run, ...]:
-    """The runs that `runs_as_arrays` took apart."""
-    sizes, out, node, row = arrays["run_sizes"].astype(int), [], 0, 0
-    for (nodes, samples, lead, rest), cruise in zip(
-        sizes.tolist(), arrays["run_cruise"].tolist(), strict=True
-    ):
-        mine = slice(node, node + nodes)
-        s, q, torques = arrays["node_s"], arrays["node_qpos"], arrays["node_tau"]
-        spline = _through(s[mine], q[mine], torques[mine], cruise)
-        timing = tau = None
-        n = samples
-        if samples:
-            timing = np.ascontiguousarray(arrays["timed_s"][row : row + samples].T)
-            tau = arrays["timed_tau"][row : row + samples]
-        else:
-            n = len(_profile(spline.length, cruise))
-        out.append(Run(spline, n, timing, tau, lead, rest))
-        node, row = node + nodes, row + samples
-    return tuple(out)

@@ -36,12 +36,8 @@ from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
 from clamber.planning.planner import Replanned
 from clamber.planning.records import Fallback, Plan
-from clamber.planning.trajectory import (
-    Trajectory,
-    runs_as_arrays,
-    runs_of_arrays,
-    sampled,
-)
+from clamber.planning.samples import runs_as_arrays, runs_of_arrays, sampled
+from clamber.planning.trajectory import Trajectory
 from clamber.run.codec import (
     VERSION,
     At,
@@ -320,7 +316,7 @@ def trajectory_of(plan: Plan, source: Path) -> Trajectory:
 
 def save_trajectory(trajectory: Trajectory, path: str | Path) -> None:
     """Write a trajectory: all samples, or where it is planned what gives them."""
-    runs = runs_as_arrays(trajectory)
+    runs = runs_as_arrays(*(getattr(trajectory, n) for n in _OF_RUNS))
     without = () if runs is None else _OF_RUNS
     write_npz(Path(path), CODEC.arrays(trajectory, without) | (runs or {}))
 

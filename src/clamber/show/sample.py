@@ -25,7 +25,8 @@ from clamber.model.records import short_repr
 from clamber.model.scene import Support
 from clamber.model.world import World
 from clamber.planning.records import Plan
-from clamber.planning.trajectory import Samples, Trajectory
+from clamber.planning.samples import Samples
+from clamber.planning.trajectory import Trajectory
 from clamber.recording.demonstration import runs
 from clamber.run.folder import (
     EXECUTION,
