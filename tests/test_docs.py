@@ -16,6 +16,7 @@ import contextlib
 import functools
 import importlib.util
 import io as text_io
+import json
 import os
 import re
 import runpy
@@ -30,6 +31,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from PIL import Image
 
 import clamber
 from clamber import cli
@@ -449,6 +451,52 @@ def test_wrong_python_yaml_output_and_mathematics_are_found(tmp_path: Path):
     with pytest.raises(AssertionError, match="nothing printed"):
         compare(["stance 1"], ["stance 2"], "here")
     compare(["a ...", "...", "c"], ["a  b", "b", "c"], "here")
+
+
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=ids)
+def test_a_notebook_is_small_and_wants_nothing_that_is_not_installed(path: Path):
+    cells = json.loads(path.read_text())["cells"]
+    assert path.stat().st_size < 20_000
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    known = {re.split(r"\W", d)[0] for d in project["dependencies"]} | {"clamber"}
+    known |= {"PIL"} if "pillow" in known else set()
+    for cell in (c for c in cells if c["cell_type"] == "code"):
+        assert cell["outputs"] == []
+        assert cell["execution_count"] is None
+        tree = ast.parse("".join(cell["source"]))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                assert {a.name.split(".")[0] for a in node.names} <= known
+            elif isinstance(node, ast.ImportFrom):
+                assert str(node.module).split(".")[0] in known
+
+
+@pytest.mark.docs
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # PIL's
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=ids)
+def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for k, cell in enumerate(json.loads(path.read_text())["cells"]):
+        if cell["cell_type"] == "code":
+            text = "".join(cell["source"])
+            exec(compile(text, f"{path.name}, cell {k}", "exec"), names)
+    assert names["verdict"].reached
+    assert (tmp_path / "runs" / "notebook" / "climb.png").is_file()
+
+
+def test_the_moving_picture_moves_and_is_small():
+    path = ROOT / "docs" / "front.webp"
+    assert path.stat().st_size < 1_000_000
+    with Image.open(path) as picture:
+        assert picture.n_frames > 50
+    for page in (ROOT / "README.md", ROOT / "docs" / "index.md"):
+        above = page.read_text().split("\n## ")[0]
+        assert "front.webp" in above
+        assert "synthetic" in above
 
 
 def test_every_page_is_in_the_menu_and_every_public_name_in_the_reference():

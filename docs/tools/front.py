@@ -107,7 +107,7 @@ def points_at(skeleton: Skeleton, t: float) -> np.ndarray:
 
 
 def pose(ends: np.ndarray) -> np.ndarray:
-    """(7,) position and quaternion of a capsule between its ends (2, 3), or of a point."""
+    """(7,) position and quaternion of a capsule between ends (2, 3), or of a point."""
     quat = np.array([1.0, 0.0, 0.0, 0.0])
     if len(ends) == 2:
         mujoco.mju_quatZ2Vec(quat, ends[1] - ends[0])
