@@ -14,6 +14,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
+import importlib.metadata
 import importlib.util
 import io as text_io
 import json
@@ -453,6 +454,37 @@ def test_wrong_python_yaml_output_and_mathematics_are_found(tmp_path: Path):
     compare(["a ...", "...", "c"], ["a  b", "b", "c"], "here")
 
 
+def imported(text: str) -> set[str]:
+    """The packages that Python imports, without those that Python brings."""
+    found = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found |= {a.name.split(".")[0] for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(str(node.module).split(".")[0])
+    return found - sys.stdlib_module_names - {"clamber"}
+
+
+def brought(extras: set[str]) -> set[str]:
+    """The packages that `pip install clamber[...]` brings by itself."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = list(project["dependencies"])
+    asked += [d for e in extras for d in project["optional-dependencies"][e]]
+    names = {re.split(r"[^\w.-]", d)[0].lower() for d in asked}
+    places = importlib.metadata.packages_distributions()
+    return {m for m, owners in places.items() if names & {o.lower() for o in owners}}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_a_page_installs_what_its_python_imports(page: Path):
+    text = page.read_text()
+    lines = re.findall(r"pip install[^`\n]*?(?:clamber|\.)\[([\w,]+)\]", text)
+    known = brought({e for line in lines for e in line.split(",")})
+    for block in blocks(page):
+        if block.language == "python":
+            assert imported(block.text) <= known, block.place
+
+
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 
@@ -460,18 +492,10 @@ NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 def test_a_notebook_is_small_and_wants_nothing_that_is_not_installed(path: Path):
     cells = json.loads(path.read_text())["cells"]
     assert path.stat().st_size < 20_000
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    known = {re.split(r"\W", d)[0] for d in project["dependencies"]} | {"clamber"}
-    known |= {"PIL"} if "pillow" in known else set()
     for cell in (c for c in cells if c["cell_type"] == "code"):
         assert cell["outputs"] == []
         assert cell["execution_count"] is None
-        tree = ast.parse("".join(cell["source"]))
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                assert {a.name.split(".")[0] for a in node.names} <= known
-            elif isinstance(node, ast.ImportFrom):
-                assert str(node.module).split(".")[0] in known
+        assert imported("".join(cell["source"])) <= brought(set())
 
 
 @pytest.mark.docs
