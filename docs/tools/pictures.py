@@ -83,7 +83,7 @@ def detection(demo, sequence) -> Figure:
 
 
 def scaling(demo, sequence, plan) -> Figure:
-    """The person on their box, and the contacts on the robot's."""
+    """The synthetic figure on its box, and the contacts on the robot's."""
     fig = Figure(figsize=(7, 3.2), layout="constrained")
     person, robot = fig.subplots(1, 2, sharey=True)
     k = int(np.searchsorted(demo.t, 0.5 * (sequence.t[-2] + sequence.t[-1])))
@@ -99,7 +99,7 @@ def scaling(demo, sequence, plan) -> Figure:
         ]
         person.plot(*np.array(trunk)[:, [0, 2]].T, color=colour, lw=3)
     for ax, found, title in (
-        (person, sequence, "the person's contacts"),
+        (person, sequence, "demonstrated (synthetic)"),
         (robot, plan.sequence, "the same at the robot's scale"),
     ):
         for box in found.scene.boxes if ax is person else plan.world.scene.boxes:
@@ -122,7 +122,7 @@ def scaling(demo, sequence, plan) -> Figure:
 
 
 def moves(sequence, plan) -> Figure:
-    """When the person's parts are in contact, and the robot's."""
+    """When the demonstration's parts are in contact, and the robot's."""
     fig = Figure(figsize=(7, 3.0), layout="constrained")
     person, robot = fig.subplots(1, 2, sharey=True)
     names = [s + x for x in ("Foot", "Knee", "Elbow", "Hand") for s in "RL"]
@@ -138,7 +138,7 @@ def moves(sequence, plan) -> Figure:
                 ax.barh(y, t[i + 1] - t[i], left=t[i], height=0.7, color=colour)
         ax.set_yticks(range(len(names)), names)
         ax.spines[["top", "right"]].set_visible(False)
-    person.set(title="the person's stances", xlabel="time [s]")
+    person.set(title="demonstrated stances (synthetic)", xlabel="time [s]")
     robot.set(title="the robot's keyframes", xlabel="keyframe")
     return fig
 
@@ -169,7 +169,7 @@ def stability() -> Figure:
 
 
 def transition(plan) -> Figure:
-    """From above: the polygon of the contacts that stay, its ellipse, the CoM's way."""
+    """From above: the polygon of the contacts that stay, its ellipse, the CoM's path."""
     fig = Figure(figsize=(7, 3.0), layout="constrained")
     chosen = (plan.changes[0], plan.changes[-2])
     for ax, change in zip(fig.subplots(1, 2), chosen, strict=True):
@@ -285,7 +285,7 @@ def physics(plan, rollout) -> Figure:
         torque.axhline(sign * world.tau_max[joint], color=RED, ls=":", lw=1)
     angle.set_ylabel("left knee [rad]")
     torque.set_ylabel("torque [N m]")
-    torque.set_xlabel("time [s]; dotted: effort limit")
+    torque.set_xlabel("time [s]; dotted: torque limit")
     finish_axes(angle)
     angle.legend(fontsize=8, frameon=False, loc="upper left")
     torque.spines[["top", "right"]].set_visible(False)
@@ -293,7 +293,7 @@ def physics(plan, rollout) -> Figure:
 
 
 def feeling(plan) -> Figure:
-    """A top as it was believed, the contacts felt, and the top that fits them."""
+    """A top as it was believed, the contacts measured, and the top that fits them."""
     fig = Figure(figsize=(7, 2.6), layout="constrained")
     ax = fig.subplots()
     box = plan.world.scene.boxes[0]
@@ -310,7 +310,7 @@ def feeling(plan) -> Figure:
         lw=2,
         label="believed after",
     )
-    ax.plot(felt[:, 0], felt[:, 2], "o", color=RED, label="contacts felt")
+    ax.plot(felt[:, 0], felt[:, 2], "o", color=RED, label="contacts measured")
     ax.set(xlabel="x [m]", ylabel="z [m]", ylim=(0.2, 0.33))
     finish_axes(ax)
     ax.legend(fontsize=8, frameon=False, loc="upper left", ncols=3)

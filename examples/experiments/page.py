@@ -1,9 +1,9 @@
 """The experiments as a page of the documentation: python page.py RUNS DOCS.
 
 Reads the sweeps `RUNS/<name of the spec>` of all specs beside this file and writes
-`DOCS/experiments.md` with a table of each; pictures and all rows are in
-`DOCS/experiments`. A sweep that is not done yet is shown as far as it is; one that has
-not begun is left out.
+`DOCS/experiments.md`, one table of searches and one of shares; pictures and all rows
+are in `DOCS/experiments`. A sweep that is not done yet is shown as far as it is; one
+that has not begun is left out.
 """
 
 from __future__ import annotations
@@ -25,15 +25,28 @@ ORDER = (
 )
 HEAD = """# Experiments
 
-How far each controller goes: `pid` follows the plan open loop, `mixed` feels its
-contacts and plans again. How the runs are chosen and the figures made is said in
+How far each controller goes: `pid` tracks the plan open loop, `mixed` measures its
+contacts and replans. How runs are chosen and figures made is said in
 [Sweeps](sweeps.md). All of this anew, also after an interruption: `make experiments`.
+"""
+SEARCHES = """## Where success breaks
+
+Success falls through one half at the value in the last but one column; `beyond` says
+that it did not within the range.
+
+| experiment | controller | from | to | runs | half of them at | 95 % interval |
+|---|---|---|---|---|---|---|
+"""
+SHARES = """## How often it succeeds
+
+| experiment | controller | runs | reached | share | 95 % interval |
+|---|---|---|---|---|---|
 """
 
 
 def page(runs: Path, pictures: Path) -> str:
     """The page as Markdown; draws the pictures."""
-    parts = [HEAD]
+    searches, shares, parts = [], [], []
     for name in ORDER:
         folder = runs / name
         if not (folder / "runs.csv").exists():
@@ -47,42 +60,42 @@ def page(runs: Path, pictures: Path) -> str:
             for line in (HERE / f"{name}.yaml").read_text().splitlines()
             if line.startswith("# ")
         ]
+        if spec.search is not None:
+            searches += [half(name, s) for s in summarise(spec, rows)]
+        else:
+            shares += [share(name, s) for s in summarise(spec, rows)]
         parts.append(f"## {spec.about}\n")
         parts.append("\n".join(comment) + "\n")
-        parts.append(
-            "<!-- read only: tens of climbs, which are minutes of computing -->\n"
-            f"```sh\nclamber sweep examples/experiments/{name}.yaml\n```\n"
-        )
         if len(rows) < wanted:
             parts.append(f"So far {len(rows)} of {wanted} runs.\n")
-        parts.append(table(summarise(spec, rows), search=spec.search is not None))
         parts.append(f"![{spec.about}](experiments/{name}.png)\n")
-        parts.append(f"[Every run, with its command](experiments/{name}.csv)\n")
-    return "\n".join(parts)
-
-
-def table(summaries: list[Summary], *, search: bool) -> str:
-    """A search is told by where it breaks, all else by its share."""
-    if not search:
-        lines = ["| controller | runs | reached | share | 95 % interval |"]
-        lines.append("|---|---|---|---|---|")
-        for s in summaries:
-            share = f"{100 * s.share:.1f} %"
-            span = f"{100 * s.low:.1f} to {100 * s.high:.1f} %"
-            lines.append(
-                f"| {s.controller} | {s.runs} | {s.reached} | {share} | {span} |"
-            )
-        return "\n".join(lines) + "\n"
-    lines = ["| controller | from | to | runs | half of them at | 95 % interval |"]
-    lines.append("|---|---|---|---|---|---|")
-    for s in summaries:
-        half = s.half if isinstance(s.half, str) else f"{s.half:.3g}"
-        ends = ["-" if x is None else f"{x:.3g}" for x in (s.half_from, s.half_to)]
-        span = " to ".join(ends) if ends != ["-", "-"] else ""
-        lines.append(
-            f"| {s.controller} | {s.start:g} | {s.end:g} | {s.runs} | {half} | {span} |"
+        parts.append(
+            f"`clamber sweep examples/experiments/{name}.yaml`; "
+            f"[every run, with its command](experiments/{name}.csv)\n"
         )
-    return "\n".join(lines) + "\n"
+    both = ((SEARCHES, searches), (SHARES, shares))
+    tables = [head + "\n".join(rows) + "\n" for head, rows in both if rows]
+    return "\n".join([HEAD, *tables, *parts])
+
+
+def share(name: str, s: Summary) -> str:
+    """A row of what is told by its share."""
+    span = f"{100 * s.low:.1f} to {100 * s.high:.1f} %"
+    return (
+        f"| {name} | {s.controller} | {s.runs} | {s.reached} |"
+        f" {100 * s.share:.1f} % | {span} |"
+    )
+
+
+def half(name: str, s: Summary) -> str:
+    """A row of what is told by where it breaks."""
+    at = s.half if isinstance(s.half, str) else f"{s.half:.3g}"
+    ends = ["-" if x is None else f"{x:.3g}" for x in (s.half_from, s.half_to)]
+    span = " to ".join(ends) if ends != ["-", "-"] else ""
+    return (
+        f"| {name} | {s.controller} | {s.start:g} | {s.end:g} | {s.runs} |"
+        f" {at} | {span} |"
+    )
 
 
 if __name__ == "__main__":
