@@ -1,4 +1,4 @@
-"""Pictures of a world without a screen, cameras that have all of it in view, videos.
+"""Pictures of a world without a screen, and cameras that have all of it in view.
 
 MuJoCo's own renderer draws, through EGL where there is one, else OSMesa. What is drawn
 depends on the records alone; the same run gives the same picture.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import importlib.util
 import itertools
 import math
 import os
@@ -18,20 +17,17 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from PIL import Image, ImageChops, ImageDraw, ImageFilter, ImageFont
+from PIL import Image, ImageChops, ImageFilter
 
-from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.execution.simulation import Rollout
+from clamber.errors import ClamberError
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World
-from clamber.planning.records import Plan
-from clamber.run.codec import whole_file
+from clamber.planning.trajectory import Samples
 from clamber.show.meshes import SHOWN_GROUPS
 from clamber.show.sample import thinned
 
@@ -48,11 +44,17 @@ PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation
 }
 Colour = tuple[float, float, float, float]  # in [0, 1]
 Shape = Callable[[mujoco.MjvGeom], None]  # makes itself of a geom that is drawn
+Report = Callable[[str, float, str], None]
 MARGIN = 0.08  # share of the picture left free around what must be seen
-EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
+SEEN_POSTURES = 60  # of a motion, of which all is in the picture
+NEAR = 0.35  # [height of the motion] around it boxes are in the picture
 GROUND_SHOWN = 60.0  # [m] half width of the ground in pictures
 FOG = (1.3, 4.0)  # [distance of the camera] where the ground begins and ends to fade
-HORIZON, GROUND_COLOUR, GRID_COLOUR = (0.965, 0.972, 0.98), (226, 229, 233), (203, 208, 214)
+HORIZON, GROUND_COLOUR, GRID_COLOUR = (
+    (0.965, 0.972, 0.98),
+    (226, 229, 233),
+    (203, 208, 214),
+)
 GRID_LINE = 3  # of the 256 texels of a square
 BOX_COLOUR: Colour = (0.80, 0.68, 0.53, 1.0)
 PAD_COLOUR: Colour = (0.13, 0.14, 0.16, 1.0)
@@ -65,12 +67,6 @@ DOWN = np.array([0.0, 0.0, -1.0])
 SHADOW_MAP = 2048  # texels along a side
 SHADED = 1.0  # [distance of the camera] around what it looks at there are shadows
 PENUMBRA = 0.0035  # [height of the picture] standard deviation of a shadow's edge
-FPS = 25
-VIDEO_SIZE, WEBP_SIZE = (640, 480), (480, 360)
-VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
-SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
-DARK, PALE, LINE = (35, 40, 48), (248, 249, 250), (205, 209, 214)
-Report = Callable[[str, float, str], None]
 _PROBE = (
     "import mujoco; c = mujoco.GLContext(8, 8); c.make_current(); "
     "mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
@@ -191,6 +187,7 @@ class Camera:
         model = _dressed(world, (width, height))
         if not fine:
             model.vis.quality.numslices, model.vis.quality.numstacks = 20, 10
+            model.vis.quality.shadowsize = SHADOW_MAP // 2
         if cutout:
             model.geom_matid[world.support_geom[GROUND]] = -1
             model.geom_rgba[world.support_geom[GROUND], 3] = 0.0
@@ -210,7 +207,7 @@ class Camera:
             for edge in _edges(b.size, b.position, b.rotation)
         ]
         self._frame = (width, height)
-        self._shade = (width, height) if fine else (width // 2, height // 2)
+        self._shade = (width, height) if fine else (size[0] // 2, size[1] // 2)
 
     def __enter__(self) -> Camera:
         """Itself."""
@@ -321,9 +318,7 @@ class Camera:
         return Image.fromarray(pixels[::-1])
 
 
-def bar(
-    kind: mujoco.mjtGeom, ends: np.ndarray, width: float, colour: Colour
-) -> Shape:
+def bar(kind: mujoco.mjtGeom, ends: np.ndarray, width: float, colour: Colour) -> Shape:
     """A capsule, a cylinder or a line from one of its ends (2, 3) [m] to the other.
 
     `width`: radius [m]; of a line [pixels].
@@ -468,173 +463,75 @@ def robot_corners(kin: Kinematics) -> np.ndarray:
 
 def view_of(
     world: World,
-    postures: Iterable[np.ndarray],
+    seen: np.ndarray,
     aspect: float,
     camera: Preset = "corner",
+    beside: np.ndarray | None = None,
 ) -> View:
-    """A view with the robot in all postures, and the near edge of the first box."""
-    kin = Kinematics(world)
-    points = []
-    for q in postures:
-        kin.update(q)
-        points.append(robot_corners(kin))
-    points += [near_edge_points(world.scene)]
+    """A view of what has to be seen of a world.
+
+    Args:
+        world: Robot and scene.
+        seen: (n, 3) as `seen_points` has them [m].
+        aspect: Width over height of the picture.
+        camera: From where.
+        beside: (m, 3) what has to be seen too [m].
+    """
+    points = seen if beside is None else np.concatenate([seen, beside])
     fovy = float(world.model.vis.global_.fovy)
-    seen = np.concatenate(points)
     yaw = float(world.scene.start[2])
-    return frame_view(seen, aspect, yaw=yaw, fovy=fovy, camera=camera)
+    return frame_view(points, aspect, yaw=yaw, fovy=fovy, camera=camera)
 
 
-def near_edge_points(scene: Scene) -> np.ndarray:
-    """(n, 3) where the first box's top begins, seen from the start, and below it."""
-    if not scene.boxes:
-        return np.zeros((0, 3))
-    top = scene.boxes[0].top
-    edge = top.edge_towards(scene.start)
-    along = EDGE_SHOWN * np.array([-edge.inward[1], edge.inward[0], 0.0])
-    ends = np.stack([top.nearest(edge.point + way) for way in (-along, along)])
-    return np.concatenate([ends, ends * [1.0, 1.0, 0.0]])
+def flat_axes(world: World, camera: Preset) -> tuple[np.ndarray, np.ndarray]:
+    """Level unit vectors to the right in a picture, and away from the camera."""
+    azimuth, elevation = PRESETS[camera]
+    yaw = math.degrees(float(world.scene.start[2]))
+    right = _camera_axes(azimuth + yaw, elevation)[0]
+    return right, np.cross([0.0, 0.0, 1.0], right)
 
 
-def seen_points(kin: Kinematics, q: np.ndarray) -> np.ndarray:
+def obstacle_points(scene: Scene, points: np.ndarray, near: float = NEAR) -> np.ndarray:
+    """(n, 3) corners of the boxes [m], of each as much as is near points (m, 3).
+
+    A box may be as large as a street, or far from where the robot goes: what is farther
+    than `near` times the height of all the points from them is left out.
+    """
+    room = near * float(np.ptp(points[:, 2])) * np.array([1.0, 1.0, 0.0])
+    low, high = points.min(axis=0) - room, points.max(axis=0) + room
+    found = [np.zeros((0, 3))]
+    for box in scene.boxes:
+        corners = box_corners(box.size, box.position, box.rotation)
+        if np.all(corners.max(axis=0)[:2] >= low[:2]) and np.all(
+            corners.min(axis=0)[:2] <= high[:2]
+        ):
+            corners[:, :2] = np.clip(corners[:, :2], low[:2], high[:2])
+            corners[:, 2] = np.maximum(corners[:, 2], min(low[2], 0.0))
+            found.append(corners)
+    return np.concatenate(found)
+
+
+def box_corners(
+    size: np.ndarray, centre: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """(8, 3) of a box [m]."""
+    signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    return centre + (signs * size) @ rotation.T
+
+
+def seen_points(
+    kin: Kinematics, q: np.ndarray | Samples, near: float = NEAR
+) -> np.ndarray:
     """(m, 3) points that a camera has to have in view [m].
 
-    They are the corners of boxes around some of the postures (n, nq), and the near
-    edge.
+    They are the corners of boxes around some of the postures (n, nq), and the obstacles
+    around them.
     """
     corners = []
-    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    for posture in thinned(q, 40):
+    for posture in thinned(q, SEEN_POSTURES):
         kin.update(posture)
         points = robot_corners(kin)
         low, high = points.min(axis=0), points.max(axis=0)
-        corners.append(low + sides * (high - low))
-    return np.concatenate([*corners, near_edge_points(kin.world.scene)]).round(3)
-
-
-@functools.cache
-def font(size: int) -> Any:
-    """Of captions, by its size in pixels."""
-    return ImageFont.load_default(size=size)
-
-
-def speedup_of(duration: float) -> int:
-    """How much faster than it was a run of that many seconds is shown."""
-    speedup = 1
-    while duration > SPEEDUP_AFTER and duration / speedup > VIDEO_SECONDS:
-        speedup *= 2
-    return speedup
-
-
-def video(
-    plan: Plan,
-    rollout: Rollout,
-    folder: str | Path,
-    *,
-    out: str | Path | None = None,
-    size: tuple[int, int] | None = None,
-    camera: Preset = "corner",
-    report: Report | None = None,
-) -> Path:
-    """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg.
-
-    Args:
-        plan: What was to be done.
-        rollout: What physics made of it.
-        folder: Where the video goes under its usual name.
-        out: The file instead, an `.mp4` or a `.webp`.
-        size: Width and height in pixels, even numbers.
-        camera: From where.
-        report: Told of the share done.
-
-    Raises:
-        InputError: Another ending.
-        MissingDependency: An `.mp4` was asked for and there is no ffmpeg.
-    """
-    has_ffmpeg = importlib.util.find_spec("imageio_ffmpeg") is not None
-    if out is None:
-        out = Path(folder) / ("video.mp4" if has_ffmpeg else "video.webp")
-    path = Path(out)
-    if path.suffix not in (".mp4", ".webp"):
-        raise InputError("a name that ends in .mp4 or .webp", source=path)
-    if path.suffix == ".mp4" and not has_ffmpeg:
-        raise MissingDependency("imageio-ffmpeg", "video")
-    fps, usual = (FPS, VIDEO_SIZE) if path.suffix == ".mp4" else (FPS / 2, WEBP_SIZE)
-    size = size or usual
-    frames = _frames(
-        plan, rollout, fps, size, camera, report or (lambda stage, share, note: None)
-    )
-    with whole_file(path) as draft:
-        if path.suffix == ".mp4":
-            _write_mp4(frames, draft, size)
-        else:
-            first, *rest = frames
-            options: dict[str, Any] = {"quality": 70, "method": 0, "loop": 0}
-            first.save(
-                draft,
-                save_all=True,
-                append_images=rest,
-                duration=round(1000 / fps),
-                **options,
-            )
-    return path
-
-
-def _frames(
-    plan: Plan,
-    rollout: Rollout,
-    fps: float,
-    size: tuple[int, int],
-    camera: Preset,
-    report: Report,
-) -> Iterator[Image.Image]:
-    """Pictures of the rollout with its clock and the move under way."""
-    duration = float(rollout.time[-1])
-    speedup = speedup_of(duration)
-    times = np.arange(0.0, duration, speedup / fps)
-    rows = np.searchsorted(rollout.time, times)
-    moves = [str(c.step) for c in plan.changes]
-    starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
-    view = view_of(rollout.world, thinned(rollout.qpos, 60), size[0] / size[1], camera)
-    letters = max(18, round(size[1] / 30))
-    with Camera(rollout.world, size, fine=False) as drawing:
-        for i, (row, t) in enumerate(zip(rows, times, strict=True)):
-            if i % 10 == 0:
-                report("video", i / len(rows), "")
-            picture = drawing.shot(rollout.qpos[row], view)
-            # On its way to where the first move begins, it is that one's.
-            move = max(int(np.searchsorted(starts, t, side="right")), 1)
-            text = moves[move - 1] if move <= len(moves) else "done"
-            clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
-            draw = ImageDraw.Draw(picture)
-            line = size[1] - letters - 10
-            draw.text((12, line), clock, font=font(letters), fill=DARK)
-            at = (size[0] - 12, line)
-            draw.text(at, text, font=font(letters), fill=DARK, anchor="ra")
-            yield picture
-    report("video", 1.0, "")
-
-
-def _write_mp4(
-    frames: Iterable[Image.Image], path: Path, size: tuple[int, int]
-) -> None:
-    import imageio_ffmpeg
-
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=FPS,
-        codec="libx264",
-        quality=5,
-        macro_block_size=2,
-        output_params=[
-            "-preset", "veryfast", "-movflags", "+faststart",
-            "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
-        ],
-    )  # fmt: skip
-    writer.send(None)
-    try:
-        for frame in frames:
-            writer.send(frame.tobytes())
-    finally:
-        writer.close()
+        corners.append(box_corners(high - low, (low + high) / 2, np.eye(3)))
+    seen = np.concatenate(corners)
+    return np.concatenate([seen, obstacle_points(kin.world.scene, seen, near)]).round(3)
