@@ -45,9 +45,17 @@ class RenderCommand:
     """One picture alone, at that time [s]."""
     camera: Literal["corner", "side", "front", "behind", "top"] = "corner"
     """From where."""
+    marks: Annotated[
+        Literal["none", "contacts", "forces"] | None,
+        tyro.conf.arg(
+            metavar="none|contacts|forces",
+            help_behavior_hint="(default: contacts in a frame, none in a video)",
+        ),
+    ] = None
+    """What is drawn over a frame or a video: contacts, or these with their forces."""
     transparent: bool = False
     """Robot and obstacles on nothing; with --frame."""
-    size: Annotated[str | None, shown("1080p|WxH", "frames 1080p")] = None
+    size: Annotated[str | None, shown("1080p|WxH", "frames 1080p, videos 720p")] = None
     """Of the video, the frame, or each picture of the sheet."""
     out: Annotated[Path | None, shown("FILE", "in RUN")] = None
     """The file."""
@@ -69,15 +77,17 @@ class RenderCommand:
             raise InputError("--video, --sheet, --frame: give one of them alone")
         if self.transparent and self.frame is None:
             raise InputError("--transparent: give --frame too, or leave it out")
-        special = self.camera != "corner" or self.size or self.out
+        if self.marks is not None and (self.sheet or self.transparent):
+            raise InputError("--marks: not with --sheet or --transparent")
+        special = self.marks or self.camera != "corner" or self.size or self.out
         if special and not any(asked):
-            flags = "--camera, --size, --out"
+            flags = "--marks, --camera, --size, --out"
             raise InputError(f"{flags}: give --video, --sheet or --frame too")
 
     def _draw(self, report: Report) -> list[Path]:
         if not (self.video or self.sheet or self.frame is not None):
             return clamber.render_run(self.run_folder, report=report)
-        from clamber.show import pictures, renderer
+        from clamber.show import film, pictures
 
         size = None if self.size is None else _picture_size(self.size)
         given: dict[str, Any] = {"camera": self.camera}
@@ -85,6 +95,7 @@ class RenderCommand:
             if self.frame is not None:
                 given |= {"out": self.out, "transparent": self.transparent}
                 given |= {} if size is None else {"size": size}
+                given |= {} if self.marks is None else {"marks": self.marks}
                 return [pictures.render_frame(self.run_folder, self.frame, **given)]
             plan = clamber.load_plan(self.run_folder)
             if self.sheet:
@@ -95,7 +106,9 @@ class RenderCommand:
                 return [pictures.keyframe_sheet(plan, path, **given)]
             rollout = clamber.load_rollout(self.run_folder)
             given |= {"out": self.out, "size": size, "report": report}
-            return [renderer.video(plan, rollout, self.run_folder, **given)]
+            given |= {} if self.marks is None else {"marks": self.marks}
+            given |= {"skeleton": film.skeleton_of_plan(plan)}
+            return [film.video(plan, rollout, self.run_folder, **given)]
         except OSError as e:
             expected = f"a file that can be written ({e.strerror or e})"
             value = str(self.out or self.run_folder)

@@ -28,6 +28,20 @@ from clamber.run.folder import (
     load_rollout,
     trajectory_of,
 )
+from clamber.show.film import Marks, video
+from clamber.show.marks import (
+    DARK,
+    LINE,
+    PALE,
+    PHASE_COLOURS,
+    arrow,
+    contact_marks,
+    dot,
+    draw_marks,
+    font,
+    keyframe_marks,
+    loads_of,
+)
 from clamber.show.plots import (
     contact_plot,
     cost_to_go_plot,
@@ -35,36 +49,23 @@ from clamber.show.plots import (
     stability_plot,
 )
 from clamber.show.renderer import (
-    DARK,
-    LINE,
-    PALE,
     Camera,
     Preset,
     Report,
     View,
-    font,
     frame_view,
     robot_corners,
-    video,
+    seen_points,
     view_of,
 )
-from clamber.show.sample import (
-    force_by_contact,
-    row_at,
-    sample_motion,
-    thinned,
-)
+from clamber.show.sample import row_at, sample_motion
+from clamber.show.skeleton import skeleton_of
 from clamber.step.posture import Keyframe
 
 SAMPLES = 400  # of a plot over time
 FRAME_SIZE = (1920, 1080)
+CLOSE = 0.12  # [height of the motion] around it boxes are in a sheet's pictures
 TILE = (400, 330)  # of the sheet of keyframes
-FORCE_LENGTH = 0.35  # [m] of the arrow of the robot's weight
-PHASE_COLOURS = {
-    "supporting": (22, 163, 74),
-    "reach-to-supportable": (234, 179, 8),
-    "sliding": (220, 38, 38),
-}
 
 
 def draw_robot(
@@ -92,7 +93,7 @@ def draw_robot(
                     limb.surfaces, ((194, 65, 12), (29, 78, 216)), strict=False
                 ):
                     at = tuple(view.project(kin.contact_point(surface, up), tile))
-                    _dot(draw, at, 5, colour)
+                    dot(draw, at, 5, colour)
                     draw.text((at[0] + 8, at[1] - 8), surface, font=font(15), fill=DARK)
             tiles.append((picture, [f"{world.robot.name}, {caption}"]))
     return _save_sheet(tiles, path, columns=2)
@@ -106,10 +107,8 @@ def draw_scene(
     kin = Kinematics(world)
     kin.update(world.home)
     tops = [s for s in scene.supports if s.name != GROUND]
-    seen = [robot_corners(kin)]
-    seen += [s.vertices for s in tops]
-    yaw, fovy = float(scene.start[2]), float(world.model.vis.global_.fovy)
-    view = frame_view(np.concatenate(seen), tile[0] / tile[1], yaw=yaw, fovy=fovy)
+    seen = np.concatenate([robot_corners(kin), *(s.vertices for s in tops)])
+    view = view_of(world, seen, tile[0] / tile[1])
     with Camera(world, tile) as camera:
         picture = camera.shot(world.home, view)
     draw = ImageDraw.Draw(picture)
@@ -117,11 +116,11 @@ def draw_scene(
         at, tip = view.project(
             np.stack([s.position, s.position + 0.15 * s.normal]), tile
         )
-        _arrow(draw, at, tip, DARK)
+        arrow(draw, at, tip, DARK)
         draw.text((at[0] + 8, at[1] + 4), s.name, font=font(15), fill=DARK)
     if scene.goal is not None:
         at = tuple(view.project(np.array([*scene.goal[:2], 0.0]), tile))
-        _dot(draw, at, 6, PHASE_COLOURS["supporting"])
+        dot(draw, at, 6, PHASE_COLOURS["supporting"])
         draw.text((at[0] + 8, at[1] - 8), "goal", font=font(15), fill=DARK)
     caption = f"{len(tops)} boxes, {robot.name} at the start"
     return _save_sheet([(picture, [caption])], path, columns=1)
@@ -137,11 +136,14 @@ def keyframe_sheet(
     """Draw each keyframe with its contacts, forces and margins.
 
     A dot marks each contact, seen through the robot: green while it supports, yellow
-    within reach of that, red where geometry alone would have it slide. Arrows are the
-    contact forces; a line falls from the centre of mass.
+    within reach of that, blue where friction holds it although it is farther from the
+    mass that it supports than the geometric guide value. Arrows are the contact forces;
+    a line falls from the centre of mass.
     """
     world = plan.world
-    view = view_of(world, [k.q for k in plan.keyframes], tile[0] / tile[1], camera)
+    postures = np.array([k.q for k in plan.keyframes])
+    seen = seen_points(Kinematics(world), postures, CLOSE)
+    view = view_of(world, seen, tile[0] / tile[1], camera)
     tiles, steps = [], [None, *(c.step for c in plan.changes)]
     with Camera(world, tile) as drawing:
         for i, key in enumerate(plan.keyframes):
@@ -163,7 +165,7 @@ def keyframe_caption(i: int, key: Keyframe, step: Step | None) -> list[str]:
         if c.contact.surface in new
     )
     e = key.equilibrium
-    push = f"holds a push of {e.margin:.2f} weights" if e.feasible else "cannot hold"
+    push = f"push margin {e.margin:.2f} m g" if e.feasible else "not in equilibrium"
     limit = f", limit {e.limiting}" if e.limiting else ""
     return [
         f"{i}  {title}",
@@ -176,45 +178,12 @@ def mark_keyframe(
     picture: Image.Image, view: View, world: World, key: Keyframe
 ) -> None:
     """Draw contacts, forces and the centre of mass over a picture."""
-    draw = ImageDraw.Draw(picture)
-    size, weight = picture.size, world.mass * 9.81
     floor = max(
         (s.position[2] for s in world.supports.values() if s.inside(key.com)),
         default=0.0,
     )
-    foot = np.array([*key.com[:2], floor])
-    a, b = (tuple(x) for x in view.project(np.array([key.com, foot]), size))
-    draw.line((a, b), fill=DARK, width=1)
-    _dot(draw, a, 5, DARK)
-    draw.line((b[0] - 5, b[1], b[0] + 5, b[1]), fill=DARK, width=2)
-    forces = force_by_contact(world, key)
-    for state in key.contacts:
-        force = forces[state.contact.surface]
-        colour = PHASE_COLOURS[state.phase]
-        at = state.contact.position
-        ends = np.array([at, at + FORCE_LENGTH / weight * force])
-        tail, tip = view.project(ends, size)
-        if np.linalg.norm(tip - tail) > 8:
-            _arrow(draw, tail, tip, colour)
-        _dot(draw, tuple(tail), 5, colour)
-
-
-def _dot(
-    draw: ImageDraw.ImageDraw, at: tuple, radius: int, colour: tuple[int, int, int]
-) -> None:
-    draw.circle(at, radius, fill=colour, outline=(255, 255, 255), width=1)
-
-
-def _arrow(
-    draw: ImageDraw.ImageDraw, tail: np.ndarray, tip: np.ndarray, colour: tuple
-) -> None:
-    way = (tip - tail) / np.linalg.norm(tip - tail)
-    side = np.array([-way[1], way[0]])
-    neck = tip - 9 * way
-    for width, fill in ((5, (255, 255, 255)), (3, colour)):
-        draw.line((*tail, *neck), fill=fill, width=width)
-    head = [tuple(tip), tuple(neck + 5 * side), tuple(neck - 5 * side)]
-    draw.polygon(head, fill=colour, outline=(255, 255, 255))
+    plumb = np.array([key.com, [*key.com[:2], floor]])
+    draw_marks(picture, view, keyframe_marks(world, key), plumb)
 
 
 def climb_sheet(
@@ -226,7 +195,8 @@ def climb_sheet(
 ) -> Path:
     """Draw what physics did, in pictures evenly spaced in time."""
     rows = np.linspace(0, len(rollout.time) - 1, frames).round().astype(int)
-    view = view_of(rollout.world, thinned(rollout.qpos, 60), tile[0] / tile[1])
+    seen = seen_points(Kinematics(rollout.world), rollout.qpos, CLOSE)
+    view = view_of(rollout.world, seen, tile[0] / tile[1])
     tiles = []
     with Camera(rollout.world, tile) as camera:
         for row in rows:
@@ -308,7 +278,10 @@ def render_run(
         files.append(climb_sheet(rollout, folder / "climb.png"))
         tell("pictures", 1.0, "")
         if with_video:
-            files.append(video(plan, rollout, folder, report=tell))
+            skeleton = None
+            if demonstration is not None:
+                skeleton = skeleton_of(*demonstration)
+            files.append(video(plan, rollout, folder, skeleton=skeleton, report=tell))
     if broken is not None:
         raise broken
     return files
@@ -343,6 +316,7 @@ def render_frame(
     size: tuple[int, int] = FRAME_SIZE,
     camera: Preset = "corner",
     transparent: bool = False,
+    marks: Marks = "contacts",
 ) -> Path:
     """Draw a run at one time as a PNG.
 
@@ -353,19 +327,23 @@ def render_frame(
         size: Width and height in pixels.
         camera: From where.
         transparent: Robot and obstacles alone, on nothing.
+        marks: Whether contacts, or contacts with their forces, are drawn over it; a
+            plan has no forces but at its keyframes.
 
     Raises:
         InputError: A file is missing or broken, or there is no such time.
         ClamberError: There is no OpenGL.
     """
     folder = Path(folder)
+    rollout, contact = None, np.zeros((0, 0), dtype=bool)
     if (folder / ROLLOUT).exists():
-        motion = load_rollout(folder, with_events=False)
-        world, t, q = motion.world, motion.time, motion.qpos
+        rollout = load_rollout(folder, with_events=False)
+        world, t, q = rollout.world, rollout.time, rollout.qpos
     else:
         plan = load_plan(folder)
         trajectory = trajectory_of(plan, folder)
         world, t, q = plan.world, trajectory.time, trajectory.q
+        contact = trajectory.contact
     if not t[0] <= time <= t[-1]:
         raise InputError(
             f"a time from {t[0]:g} to {t[-1]:.2f} s", source="--frame", value=time
@@ -374,10 +352,20 @@ def render_frame(
     path = folder / f"frame-{time:g}.png" if out is None else Path(out)
     if path.suffix != ".png":
         raise InputError("a name that ends in .png", source=path)
-    view = view_of(world, thinned(q, 60), size[0] / size[1], camera)
+    kin = Kinematics(world)
+    view = view_of(world, seen_points(kin, q), size[0] / size[1], camera)
     with Camera(world, size, cutout=transparent) as drawing:
         draw = drawing.cutout if transparent else drawing.shot
         picture = draw(q[row], view)
+    if marks != "none" and not transparent:
+        forces = None
+        if rollout is not None:
+            (loaded,), (forces,) = loads_of(rollout, np.array([row]))
+        else:
+            loaded = contact[row]
+        kin.update(q[row])
+        forces = forces if marks == "forces" else None
+        draw_marks(picture, view, contact_marks(kin, loaded, forces))
     with whole_file(path) as draft:
         picture.save(draft)
     return path

@@ -1,4 +1,4 @@
-"""Pictures of a world without a screen, cameras that have all of it in view, videos.
+"""Pictures of a world without a screen, and cameras that have all of it in view.
 
 MuJoCo's own renderer draws, through EGL where there is one, else OSMesa. What is drawn
 depends on the records alone; the same run gives the same picture.
@@ -10,31 +10,29 @@ from __future__ import annotations
 
 import copy
 import functools
-import importlib.util
+import itertools
 import math
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageChops, ImageFilter
 
-from clamber.errors import ClamberError, InputError, MissingDependency
-from clamber.execution.simulation import Rollout
+from clamber.errors import ClamberError
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import World
-from clamber.planning.records import Plan
-from clamber.run.codec import whole_file
+from clamber.planning.trajectory import Samples
+from clamber.show.meshes import SHOWN_GROUPS
 from clamber.show.sample import thinned
 
 Preset = Literal["corner", "side", "front", "behind", "top"]
-FROM_ABOVE = -70.0  # [deg] elevation from which the camera's light whitens the ground
+STEEP = 70.0  # [deg] elevation from which a camera has no ahead of its own
 PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation, of a
     # robot that faces along x. From the left and a little behind, the box hides neither
     # the feet on the ground nor the hands on its top.
@@ -44,15 +42,31 @@ PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation
     "behind": (0.0, -20.0),
     "top": (270.0, -89.0),
 }
-MARGIN = 0.08  # share of the picture left free around what must be seen
-EDGE_SHOWN = 0.30  # [m] of the near edge, to either side
-GROUND_SHOWN = 5.5  # [m] half width of the ground in pictures
-FPS = 25
-VIDEO_SIZE, WEBP_SIZE = (640, 480), (480, 360)
-VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
-SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
-DARK, PALE, LINE = (35, 40, 48), (248, 249, 250), (205, 209, 214)
+Colour = tuple[float, float, float, float]  # in [0, 1]
+Shape = Callable[[mujoco.MjvGeom], None]  # makes itself of a geom that is drawn
 Report = Callable[[str, float, str], None]
+MARGIN = 0.08  # share of the picture left free around what must be seen
+SEEN_POSTURES = 60  # of a motion, of which all is in the picture
+NEAR = 0.35  # [height of the motion] around it boxes are in the picture
+GROUND_SHOWN = 60.0  # [m] half width of the ground in pictures
+FOG = (1.3, 4.0)  # [distance of the camera] where the ground begins and ends to fade
+HORIZON, GROUND_COLOUR, GRID_COLOUR = (
+    (0.965, 0.972, 0.98),
+    (226, 229, 233),
+    (203, 208, 214),
+)
+GRID_LINE = 3  # of the 256 texels of a square
+BOX_COLOUR: Colour = (0.80, 0.68, 0.53, 1.0)
+PAD_COLOUR: Colour = (0.13, 0.14, 0.16, 1.0)
+EDGE_COLOUR: Colour = (0.32, 0.26, 0.20, 1.0)
+EDGE_LIFT, EDGE_WIDTH = 0.002, 1.5  # [m], [pixels]
+MOST_EDGED = 40  # boxes; of more, as of a terrain, the edges are left out
+EXTRA_SHAPES = 1500  # beside those of the model
+SUN, FILL, AMBIENT = 0.62, 0.26, 0.34  # of the light, colourless
+DOWN = np.array([0.0, 0.0, -1.0])
+SHADOW_MAP = 2048  # texels along a side
+SHADED = 1.0  # [distance of the camera] around what it looks at there are shadows
+PENUMBRA = 0.0035  # [height of the picture] standard deviation of a shadow's edge
 _PROBE = (
     "import mujoco; c = mujoco.GLContext(8, 8); c.make_current(); "
     "mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
@@ -141,14 +155,19 @@ def _camera_axes(
 
 
 class Camera:
-    """Draws configurations of a world; closed as a context manager."""
+    """Draws configurations of a world; closed as a context manager.
+
+    Shadows are soft: a picture without them is darkened by the share of light that a
+    smaller one with them has lost, which is blurred first. That costs less than a map
+    of shadows fine enough not to show its steps.
+    """
 
     def __init__(
         self,
         world: World,
         size: tuple[int, int],
         *,
-        smooth: bool = True,
+        fine: bool = True,
         cutout: bool = False,
     ) -> None:
         """Open a context.
@@ -156,22 +175,19 @@ class Camera:
         Args:
             world: What to draw.
             size: Width and height in pixels.
-            smooth: Edges are smoothed; costs three times the time in software.
-            cutout: For `cutout`, which smooths edges by itself; `shot` then lacks the
-                ground.
+            fine: Edges and shadows are drawn at twice the size, as for a picture that
+                is looked at for long; half as long without, as for those of a video.
+            cutout: For `cutout`; `shot` then lacks the ground.
         """
         self._gl: Any = None
         self._context: Any = None
-        width, height = size if not cutout else (2 * size[0], 2 * size[1])
-        model = copy.copy(world.model)  # looks are set here, the world's stay
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        model.vis.quality.offsamples = 4 if smooth and not cutout else 0
-        model.vis.quality.shadowsize = 2048 if height < 700 else 8192  # no steps seen
-        if not smooth:
-            model.vis.quality.numslices, model.vis.quality.numstacks = 16, 8
-        # A ground without end is shaded with speckles where the shadow map ends.
-        model.vis.map.shadowclip = 4.0
-        model.geom_size[world.support_geom[GROUND], :2] = GROUND_SHOWN
+        self._size = size
+        scale = 2.0 if fine or cutout else 1.25
+        width, height = round(scale * size[0]), round(scale * size[1])
+        model = _dressed(world, (width, height))
+        if not fine:
+            model.vis.quality.numslices, model.vis.quality.numstacks = 20, 10
+            model.vis.quality.shadowsize = SHADOW_MAP // 2
         if cutout:
             model.geom_matid[world.support_geom[GROUND]] = -1
             model.geom_rgba[world.support_geom[GROUND], 3] = 0.0
@@ -182,10 +198,16 @@ class Camera:
             model, mujoco.mjtFontScale.mjFONTSCALE_100.value
         )
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 200)
+        self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + EXTRA_SHAPES)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._rect = mujoco.MjrRect(0, 0, width, height)
-        self._pixels = np.zeros((height, width, 3), dtype=np.uint8)
+        boxes = world.scene.boxes if not cutout else ()
+        self._edges = [
+            edge
+            for b in (boxes if len(boxes) <= MOST_EDGED else ())
+            for edge in _edges(b.size, b.position, b.rotation)
+        ]
+        self._frame = (width, height)
+        self._shade = (width, height) if fine else (size[0] // 2, size[1] // 2)
 
     def __enter__(self) -> Camera:
         """Itself."""
@@ -198,27 +220,37 @@ class Camera:
         if self._gl is not None:
             self._gl.free()
 
-    def shot(self, q: np.ndarray, view: View) -> Image.Image:
-        """A picture of the configuration `q` (nq,)."""
-        self._update(q, view)
-        return Image.fromarray(self._drawn())
+    def shot(
+        self, q: np.ndarray, view: View, shapes: Iterable[Shape] = ()
+    ) -> Image.Image:
+        """A picture of the configuration `q` (nq,), and of shapes beside it."""
+        self._update(q, view, shapes)
+        picture = self._drawn(self._frame).resize(self._size, Image.Resampling.BOX)
+        lit = np.asarray(self._drawn(self._shade), dtype=np.float32)
+        shaded = np.asarray(self._drawn(self._shade, shadows=True), dtype=np.float32)
+        left = (shaded.sum(axis=2) + 1.0) / (lit.sum(axis=2) + 1.0)
+        left = Image.fromarray((255 * np.minimum(left, 1.0)).astype(np.uint8))
+        blur = ImageFilter.GaussianBlur(PENUMBRA * left.height)
+        left = left.filter(blur).resize(self._size, Image.Resampling.BILINEAR)
+        return ImageChops.multiply(picture, Image.merge("RGB", (left,) * 3))
 
     def cutout(self, q: np.ndarray, view: View) -> Image.Image:
         """Robot and obstacles alone (RGBA), on nothing.
 
-        Drawn twice as large without smoothing, so that no pixel mixes with what lies
-        behind it, and averaged with its mask: edges keep their own colour.
+        Averaged with its mask, so that no pixel mixes with what lies behind it: edges
+        keep their own colour.
         """
-        self._update(q, view)
-        colour = self._drawn().astype(float)
+        self._update(q, view, ())
+        colour = np.asarray(self._drawn(self._frame), dtype=float)
         flags = (
             mujoco.mjtRndFlag.mjRND_SEGMENT.value,
             mujoco.mjtRndFlag.mjRND_IDCOLOR.value,
         )
         self._scene.flags[list(flags)] = 1
-        there = np.any(self._drawn() > 0, axis=2)[..., None].astype(float)
+        drawn = np.asarray(self._drawn(self._frame))
+        there = np.any(drawn > 0, axis=2)[..., None].astype(float)
         self._scene.flags[list(flags)] = 0
-        height, width = there.shape[0] // 2, there.shape[1] // 2
+        width, height = self._size
 
         def halved(x: np.ndarray) -> np.ndarray:
             return x.reshape(height, 2, width, 2, -1).mean(axis=(1, 3))
@@ -228,13 +260,14 @@ class Camera:
         pixels = np.concatenate([colour, 255 * share], axis=2)
         return Image.fromarray(pixels.round().astype(np.uint8), "RGBA")
 
-    def _update(self, q: np.ndarray, view: View) -> None:
+    def _update(self, q: np.ndarray, view: View, shapes: Iterable[Shape]) -> None:
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._camera.lookat[:] = view.lookat
         self._camera.distance = view.distance
         self._camera.azimuth, self._camera.elevation = view.azimuth, view.elevation
+        scene = self._scene
         mujoco.mjv_updateScene(
             self._model,
             self._data,
@@ -242,18 +275,137 @@ class Camera:
             None,
             self._camera,
             mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
+            scene,
         )
-        if view.elevation < FROM_ABOVE:  # the sun alone lights the ground enough
-            for light in self._scene.lights[: self._scene.nlight]:
-                if light.headlight:
-                    light.diffuse = light.specular = np.zeros(3)
+        for shape in (*shapes, *self._edges):
+            if scene.ngeom < scene.maxgeom:
+                shape(scene.geoms[scene.ngeom])
+                scene.ngeom += 1
+        self._light(view)
 
-    def _drawn(self) -> np.ndarray:
-        """(height, width, 3) uint8 of the scene as it was last updated."""
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
-        return self._pixels[::-1].copy()
+    def _light(self, view: View) -> None:
+        """The sun over the left shoulder, a fill from the right; fog at the horizon."""
+        scene, context, size = self._scene, self._context, view.distance
+        right, _, forward = view.axes
+        ahead = forward * [1.0, 1.0, 0.0]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+        if abs(view.elevation) > STEEP:
+            ahead = np.cross([0.0, 0.0, 1.0], right)
+        scene.nlight = 2
+        for light, way, strength in (
+            (scene.lights[0], 0.5 * ahead + 0.45 * right + DOWN, SUN),
+            (scene.lights[1], 0.7 * ahead - 0.8 * right + 0.7 * DOWN, FILL),
+        ):
+            way = way / np.linalg.norm(way)
+            light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
+            light.headlight, light.castshadow = 0, int(strength is SUN)
+            light.dir[:], light.pos[:] = way, view.lookat - 1.5 * size * way
+            light.diffuse[:] = strength
+            # In the shadow of a light there is not even its ambient part.
+            light.ambient[:] = 0.0 if strength is SUN else AMBIENT
+            light.specular[:] = 0.25 if strength is SUN else 0.0
+        context.shadowClip = SHADED * size
+        context.fogStart, context.fogEnd = FOG[0] * size, FOG[1] * size
+        scene.flags[mujoco.mjtRndFlag.mjRND_FOG.value] = 1
+
+    def _drawn(self, size: tuple[int, int], *, shadows: bool = False) -> Image.Image:
+        """The scene as it was last updated."""
+        rect = mujoco.MjrRect(0, 0, *size)
+        pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = int(shadows)
+        mujoco.mjr_render(rect, self._scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, rect, self._context)
+        return Image.fromarray(pixels[::-1])
+
+
+def bar(kind: mujoco.mjtGeom, ends: np.ndarray, width: float, colour: Colour) -> Shape:
+    """A capsule, a cylinder or a line from one of its ends (2, 3) [m] to the other.
+
+    `width`: radius [m]; of a line [pixels].
+    """
+
+    def put(geom: mujoco.MjvGeom) -> None:
+        _plain(geom, kind, np.full(3, width), np.zeros(3), np.eye(3), colour)
+        mujoco.mjv_connector(geom, kind, width, *ends)
+
+    return put
+
+
+def ball(centre: np.ndarray, radius: float, colour: Colour) -> Shape:
+    """A ball at a point (3,) [m]."""
+    kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius)
+    return lambda geom: _plain(geom, kind, size, centre, np.eye(3), colour)
+
+
+def block(
+    size: np.ndarray, centre: np.ndarray, rotation: np.ndarray, colour: Colour
+) -> list[Shape]:
+    """A box of edges (3,) [m] and the lines along them."""
+    kind = mujoco.mjtGeom.mjGEOM_BOX
+    solid = lambda geom: _plain(geom, kind, size / 2, centre, rotation, colour)  # noqa: E731
+    return [solid, *_edges(size, centre, rotation)]
+
+
+def _plain(
+    geom: mujoco.MjvGeom,
+    kind: mujoco.mjtGeom,
+    size: np.ndarray,
+    centre: np.ndarray,
+    rotation: np.ndarray,
+    colour: Colour,
+) -> None:
+    rgba = np.array(colour, dtype=np.float32)
+    mujoco.mjv_initGeom(geom, kind, size, centre, rotation.ravel(), rgba)
+    geom.specular, geom.shininess = 0.1, 0.2
+
+
+def _edges(
+    size: np.ndarray, centre: np.ndarray, rotation: np.ndarray
+) -> Iterator[Shape]:
+    """The twelve edges of a box, a little outside of it so that they are seen."""
+    half = (size + EDGE_LIFT) / 2
+    for axis in range(3):
+        for a, b in itertools.product((-1.0, 1.0), repeat=2):
+            ends = np.empty((2, 3))
+            ends[:, axis] = -half[axis], half[axis]
+            ends[:, (axis + 1) % 3] = a * half[(axis + 1) % 3]
+            ends[:, (axis + 2) % 3] = b * half[(axis + 2) % 3]
+            ends = centre + ends @ rotation.T
+            yield bar(mujoco.mjtGeom.mjGEOM_LINE, ends, EDGE_WIDTH, EDGE_COLOUR)
+
+
+def _dressed(world: World, size: tuple[int, int]) -> mujoco.MjModel:
+    """The world's model as it is drawn: its looks are changed, the world's stay."""
+    model = copy.copy(world.model)
+    model.vis.global_.offwidth, model.vis.global_.offheight = size
+    model.vis.quality.offsamples = 0  # drawn larger and averaged instead
+    model.vis.quality.shadowsize = SHADOW_MAP
+    model.vis.rgba.fog = [*HORIZON, 1.0]
+    ground = world.support_geom[GROUND]
+    model.geom_size[ground, :2] = GROUND_SHOWN
+    for texture in range(model.ntex):
+        first, n = int(model.tex_adr[texture]), int(model.tex_nchannel[texture])
+        wide, high = int(model.tex_width[texture]), int(model.tex_height[texture])
+        texels = np.empty((high, wide, n), dtype=np.uint8)
+        name = model.texture(texture).name
+        if name == "clamber_ground":
+            texels[:] = GROUND_COLOUR
+            texels[:GRID_LINE] = texels[:, :GRID_LINE] = GRID_COLOUR
+        elif name == "clamber_sky":
+            texels[:] = np.round(255 * np.array(HORIZON))
+        else:
+            continue
+        model.tex_data[first : first + texels.size] = texels.ravel()
+    boxes = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+    model.geom_rgba[boxes] = BOX_COLOUR
+    # Shapes that bear on something stand out of a robot's own meshes like balls; as
+    # pads of rubber they belong to it.
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+    meshes = own & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
+    if np.any(meshes & np.isin(model.geom_group, SHOWN_GROUPS)):
+        pads = [g for s in world.surfaces.values() for g in s.geoms]
+        model.geom_matid[pads], model.geom_rgba[pads] = -1, PAD_COLOUR
+    return model
 
 
 def frame_view(
@@ -311,178 +463,75 @@ def robot_corners(kin: Kinematics) -> np.ndarray:
 
 def view_of(
     world: World,
-    postures: Iterable[np.ndarray],
+    seen: np.ndarray,
     aspect: float,
     camera: Preset = "corner",
+    beside: np.ndarray | None = None,
 ) -> View:
-    """A view with the robot in all postures, and the near edge of the first box."""
-    kin = Kinematics(world)
-    points = []
-    for q in postures:
-        kin.update(q)
-        points.append(robot_corners(kin))
-    points += [near_edge_points(world.scene)]
+    """A view of what has to be seen of a world.
+
+    Args:
+        world: Robot and scene.
+        seen: (n, 3) as `seen_points` has them [m].
+        aspect: Width over height of the picture.
+        camera: From where.
+        beside: (m, 3) what has to be seen too [m].
+    """
+    points = seen if beside is None else np.concatenate([seen, beside])
     fovy = float(world.model.vis.global_.fovy)
-    seen = np.concatenate(points)
     yaw = float(world.scene.start[2])
-    return frame_view(seen, aspect, yaw=yaw, fovy=fovy, camera=camera)
+    return frame_view(points, aspect, yaw=yaw, fovy=fovy, camera=camera)
 
 
-def near_edge_points(scene: Scene) -> np.ndarray:
-    """(n, 3) where the first box's top begins, seen from the start, and below it."""
-    if not scene.boxes:
-        return np.zeros((0, 3))
-    top = scene.boxes[0].top
-    edge = top.edge_towards(scene.start)
-    along = EDGE_SHOWN * np.array([-edge.inward[1], edge.inward[0], 0.0])
-    ends = np.stack([top.nearest(edge.point + way) for way in (-along, along)])
-    return np.concatenate([ends, ends * [1.0, 1.0, 0.0]])
+def flat_axes(world: World, camera: Preset) -> tuple[np.ndarray, np.ndarray]:
+    """Level unit vectors to the right in a picture, and away from the camera."""
+    azimuth, elevation = PRESETS[camera]
+    yaw = math.degrees(float(world.scene.start[2]))
+    right = _camera_axes(azimuth + yaw, elevation)[0]
+    return right, np.cross([0.0, 0.0, 1.0], right)
 
 
-def seen_points(kin: Kinematics, q: np.ndarray) -> np.ndarray:
+def obstacle_points(scene: Scene, points: np.ndarray, near: float = NEAR) -> np.ndarray:
+    """(n, 3) corners of the boxes [m], of each as much as is near points (m, 3).
+
+    A box may be as large as a street, or far from where the robot goes: what is farther
+    than `near` times the height of all the points from them is left out.
+    """
+    room = near * float(np.ptp(points[:, 2])) * np.array([1.0, 1.0, 0.0])
+    low, high = points.min(axis=0) - room, points.max(axis=0) + room
+    found = [np.zeros((0, 3))]
+    for box in scene.boxes:
+        corners = box_corners(box.size, box.position, box.rotation)
+        if np.all(corners.max(axis=0)[:2] >= low[:2]) and np.all(
+            corners.min(axis=0)[:2] <= high[:2]
+        ):
+            corners[:, :2] = np.clip(corners[:, :2], low[:2], high[:2])
+            corners[:, 2] = np.maximum(corners[:, 2], min(low[2], 0.0))
+            found.append(corners)
+    return np.concatenate(found)
+
+
+def box_corners(
+    size: np.ndarray, centre: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """(8, 3) of a box [m]."""
+    signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    return centre + (signs * size) @ rotation.T
+
+
+def seen_points(
+    kin: Kinematics, q: np.ndarray | Samples, near: float = NEAR
+) -> np.ndarray:
     """(m, 3) points that a camera has to have in view [m].
 
-    They are the corners of boxes around some of the postures (n, nq), and the near
-    edge.
+    They are the corners of boxes around some of the postures (n, nq), and the obstacles
+    around them.
     """
     corners = []
-    sides = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    for posture in thinned(q, 40):
+    for posture in thinned(q, SEEN_POSTURES):
         kin.update(posture)
         points = robot_corners(kin)
         low, high = points.min(axis=0), points.max(axis=0)
-        corners.append(low + sides * (high - low))
-    return np.concatenate([*corners, near_edge_points(kin.world.scene)]).round(3)
-
-
-@functools.cache
-def font(size: int) -> Any:
-    """Of captions, by its size in pixels."""
-    return ImageFont.load_default(size=size)
-
-
-def speedup_of(duration: float) -> int:
-    """How much faster than it was a run of that many seconds is shown."""
-    speedup = 1
-    while duration > SPEEDUP_AFTER and duration / speedup > VIDEO_SECONDS:
-        speedup *= 2
-    return speedup
-
-
-def video(
-    plan: Plan,
-    rollout: Rollout,
-    folder: str | Path,
-    *,
-    out: str | Path | None = None,
-    size: tuple[int, int] | None = None,
-    camera: Preset = "corner",
-    report: Report | None = None,
-) -> Path:
-    """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg.
-
-    Args:
-        plan: What was to be done.
-        rollout: What physics made of it.
-        folder: Where the video goes under its usual name.
-        out: The file instead, an `.mp4` or a `.webp`.
-        size: Width and height in pixels, even numbers.
-        camera: From where.
-        report: Told of the share done.
-
-    Raises:
-        InputError: Another ending.
-        MissingDependency: An `.mp4` was asked for and there is no ffmpeg.
-    """
-    has_ffmpeg = importlib.util.find_spec("imageio_ffmpeg") is not None
-    if out is None:
-        out = Path(folder) / ("video.mp4" if has_ffmpeg else "video.webp")
-    path = Path(out)
-    if path.suffix not in (".mp4", ".webp"):
-        raise InputError("a name that ends in .mp4 or .webp", source=path)
-    if path.suffix == ".mp4" and not has_ffmpeg:
-        raise MissingDependency("imageio-ffmpeg", "video")
-    fps, usual = (FPS, VIDEO_SIZE) if path.suffix == ".mp4" else (FPS / 2, WEBP_SIZE)
-    size = size or usual
-    frames = _frames(
-        plan, rollout, fps, size, camera, report or (lambda stage, share, note: None)
-    )
-    with whole_file(path) as draft:
-        if path.suffix == ".mp4":
-            _write_mp4(frames, draft, size)
-        else:
-            first, *rest = frames
-            options: dict[str, Any] = {"quality": 70, "method": 0, "loop": 0}
-            first.save(
-                draft,
-                save_all=True,
-                append_images=rest,
-                duration=round(1000 / fps),
-                **options,
-            )
-    return path
-
-
-def _frames(
-    plan: Plan,
-    rollout: Rollout,
-    fps: float,
-    size: tuple[int, int],
-    camera: Preset,
-    report: Report,
-) -> Iterator[Image.Image]:
-    """Pictures of the rollout with its clock and the move under way."""
-    duration = float(rollout.time[-1])
-    speedup = speedup_of(duration)
-    times = np.arange(0.0, duration, speedup / fps)
-    rows = np.searchsorted(rollout.time, times)
-    moves = [str(c.step) for c in plan.changes]
-    starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
-    drawn = (
-        size[0] * 5 // 4,
-        size[1] * 5 // 4,
-    )  # smoother edges at a third of the price
-    view = view_of(rollout.world, thinned(rollout.qpos, 60), size[0] / size[1], camera)
-    letters = max(18, round(size[1] / 30))
-    with Camera(rollout.world, drawn, smooth=False) as drawing:
-        for i, (row, t) in enumerate(zip(rows, times, strict=True)):
-            if i % 10 == 0:
-                report("video", i / len(rows), "")
-            picture = drawing.shot(rollout.qpos[row], view)
-            picture = picture.resize(size, Image.Resampling.BILINEAR)
-            # On its way to where the first move begins, it is that one's.
-            move = max(int(np.searchsorted(starts, t, side="right")), 1)
-            text = moves[move - 1] if move <= len(moves) else "done"
-            clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
-            draw = ImageDraw.Draw(picture)
-            line = size[1] - letters - 10
-            draw.text((12, line), clock, font=font(letters), fill=DARK)
-            at = (size[0] - 12, line)
-            draw.text(at, text, font=font(letters), fill=DARK, anchor="ra")
-            yield picture
-    report("video", 1.0, "")
-
-
-def _write_mp4(
-    frames: Iterable[Image.Image], path: Path, size: tuple[int, int]
-) -> None:
-    import imageio_ffmpeg
-
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=FPS,
-        codec="libx264",
-        quality=5,
-        macro_block_size=2,
-        output_params=[
-            "-preset", "veryfast", "-movflags", "+faststart",
-            "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
-        ],
-    )  # fmt: skip
-    writer.send(None)
-    try:
-        for frame in frames:
-            writer.send(frame.tobytes())
-    finally:
-        writer.close()
+        corners.append(box_corners(high - low, (low + high) / 2, np.eye(3)))
+    seen = np.concatenate(corners)
+    return np.concatenate([seen, obstacle_points(kin.world.scene, seen, near)]).round(3)

@@ -37,8 +37,8 @@ from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
 from clamber.run.codec import whole_file
 from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, fallback_note
+from clamber.show.marks import FORCE_LENGTH
 from clamber.show.meshes import Mesh, body_meshes, body_poses
-from clamber.show.pictures import FORCE_LENGTH
 from clamber.show.renderer import PRESETS, seen_points
 from clamber.show.sample import (
     keyframe_times,

@@ -19,9 +19,9 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Support
 from clamber.model.se3 import frame_from_normal, quat_from_matrix
 from clamber.planning.records import Plan
+from clamber.show.marks import FORCE_LENGTH, PHASE_COLOURS
 from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.page import paragraphs
-from clamber.show.pictures import FORCE_LENGTH, PHASE_COLOURS
 from clamber.show.sample import (
     force_by_contact,
     keyframe_times,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from clamber.contact.contact import ContactInterval, ContactSequence
 from clamber.model.records import short_repr
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
+from clamber.recording.built_in import BUILT_IN, source_of
 from clamber.recording.demonstration import SIDES, Demonstration, wrist
 
 CHEST = "Chest"  # the middle of the shoulders, which no recording has
@@ -90,6 +92,14 @@ def skeleton_of(demo: Demonstration, sequence: ContactSequence | None) -> Skelet
         ),
         head=at.get("Head"),
     )
+
+
+def recording_named(source: str) -> str | None:
+    """The recording that a sequence names as its source, where it can be found."""
+    for name in BUILT_IN:
+        if source == source_of(name):
+            return name
+    return source if source and Path(source).is_file() else None
 
 
 def beside(
