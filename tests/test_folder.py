@@ -485,7 +485,7 @@ def test_a_rollout_survives_the_disk_to_the_last_bit(
     plan: Plan, rollout: Rollout, copied: Path
 ):
     save_rollout(plan, rollout, copied)
-    assert not list(differences(load_rollout(copied), rollout))
+    assert not list(differences(load_rollout(copied), replace(rollout, plan=None)))
 
 
 def test_what_ran_and_what_was_planned_are_both_kept(plan: Plan, copied: Path):

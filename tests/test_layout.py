@@ -200,7 +200,11 @@ def test_importing_the_package_loads_no_library():
     out = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert not {"numpy", "mujoco", "scipy", "matplotlib"} & set(out.stdout.split())
+    loaded = set(out.stdout.split())
+    own = {m for m in loaded if m.split(".")[0] == "clamber"}
+    assert own <= {"clamber", "clamber.model", "clamber.model.shown"}
+    libraries = {"numpy", "mujoco", "scipy", "matplotlib", "PIL", "pydantic", "yaml"}
+    assert not (libraries | {"tyro", "rich", "viser", "inspect"}) & loaded
 
 
 def test_the_version_is_written_the_same_everywhere():

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from clamber.model.shown import shown_by
+
 __version__ = "0.1.0"
 
 _HOME = {
@@ -97,6 +99,8 @@ _HOME = {
 }
 
 __all__ = ["__version__", *_HOME]
+
+shown_by(lambda: import_module("clamber.show.notebook"))
 
 
 def __getattr__(name: str) -> object:

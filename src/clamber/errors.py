@@ -9,6 +9,7 @@ is a `MissingDependency` with the line that gets it.
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -51,6 +52,43 @@ def unreadable(
     """A file that cannot be opened, why, and what to do then."""
     why = error.strerror or "unreadable"
     return InputError(f"a readable file ({why}); {then}", path)
+
+
+class WrongType(InputError, TypeError):
+    """An argument is of another kind than its function takes."""
+
+    def __init__(
+        self, function: str, field: str, kinds: Sequence[str], value: object
+    ) -> None:
+        """Compose the sentence, with what makes the one of the other.
+
+        Args:
+            function: Its name.
+            field: Name of the argument.
+            kinds: That it takes, such as `Plan`.
+            value: The value given.
+        """
+        given = "path" if isinstance(value, str | Path) else type(value).__name__
+        takes = " or ".join(f"{'an' if k[0] in 'AEIO' else 'a'} {k}" for k in kinds)
+        text = f"{function}() takes {takes} as {field}, got {type(value).__name__}"
+        made = [_MADE_BY[given, k] for k in kinds if (given, k) in _MADE_BY]
+        super().__init__(f"{text}: did you mean {made[0]}?" if made else text)
+        self.field, self.value = field, value
+
+
+_MADE_BY = {  # what there is, what is wanted: what makes the one of the other
+    ("path", "ContactSequence"): "load_sequence(...)",
+    ("path", "Demonstration"): "load_demo(...)",
+    ("path", "GeneralPolicy"): "load_policy(...)",
+    ("path", "Plan"): "load_plan(...)",
+    ("path", "Rollout"): "load_rollout(...)",
+    ("path", "Spec"): "load_spec(...)",
+    ("Demonstration", "ContactSequence"): "detect_contacts(...)",
+    ("ContactSequence", "Plan"): "plan(...)",
+    ("Plan", "Rollout"): "simulate(...)",
+    ("Ranked", "Plan"): "its .plan",
+    ("Replanned", "Plan"): "its .best.plan",
+}
 
 
 class MissingDependency(ClamberError):

@@ -15,6 +15,7 @@ import numpy as np
 
 from clamber.model.records import short_repr
 from clamber.model.scene import GROUND, Scene
+from clamber.model.shown import Shown
 
 Region = Literal["G", "M", "O"]
 # Surfaces of a person: each side has a hand, an elbow, a knee and a foot.
@@ -139,7 +140,12 @@ class Stance:
 class ContactInterval:
     """One contact of one part over time, as detected.
 
-    A part that bears load and is no surface (a seat) has `is_surface` False.
+    Attributes:
+        part: Of the person, such as `LHand`.
+        is_surface: False of a part that bears load and is no surface: a seat.
+        t0: When it begins [s].
+        t1: When it ends [s].
+        contact: Where it is.
     """
 
     part: str
@@ -152,7 +158,7 @@ class ContactInterval:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class ContactSequence:
+class ContactSequence(Shown):
     """Stances in order: what `detect_contacts` finds and `plan` starts from.
 
     Attributes:

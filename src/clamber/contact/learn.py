@@ -35,6 +35,7 @@ from clamber.contact.policy import (
 )
 from clamber.contact.steps import MOVED
 from clamber.errors import InputError
+from clamber.model.arguments import checks_types
 from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat, wrap
 
@@ -48,6 +49,7 @@ _INNER = {  # where both are down, the surface nearer to the trunk bears the loa
 _SEGMENTS = {"arm": ("upper_arm", "forearm"), "leg": ("thigh", "shank")}
 
 
+@checks_types
 def learn_policy(sequences: Sequence[ContactSequence]) -> GeneralPolicy:
     """Learn the general policy that contact sequences of people have in common.
 

@@ -24,6 +24,7 @@ from typing import Literal
 import numpy as np
 
 from clamber.contact.contact import PARTS, Region, Stance
+from clamber.model.arguments import checks_types
 from clamber.model.records import short_repr
 from clamber.model.scene import Edge, Scene, Support
 from clamber.model.se3 import wrap
@@ -256,6 +257,7 @@ def _over(support: Support, p: np.ndarray) -> bool:
     return bool(support.inside(foot))
 
 
+@checks_types
 def pelvis_distribution(
     policy: GeneralPolicy,
     edges: tuple[Edge, ...],

@@ -27,36 +27,43 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """What the planner does not know. Lengths [m], angles [rad], forces [N]."""
+    """What the planner does not know.
+
+    Attributes:
+        height: Every box is higher by this [m].
+        unevenness: Tops are warped: by `seed`, tiles whose heights are off by up to
+            this [m].
+        roll: Boxes are tilted by this [rad] about x, through the middle of their near
+            edge.
+        pitch: Boxes are tilted by this [rad] about their near edge; positive: the far
+            end sinks.
+        friction: Coulomb coefficient of ground and boxes; None: as in the scene.
+        x: The robot starts off by this [m].
+        y: The robot starts off by this [m].
+        yaw: The robot starts turned by this [rad].
+        mass: Factor on the masses and inertias of all links.
+        effort: Factor on the effort limits of all joints.
+        delay: From sensing to command [s]; whole milliseconds.
+        noise: Factor on the noise of the sensors.
+        push: Horizontal force [N] on the pelvis for 0.2 s; by `seed`, its time and its
+            direction.
+        seed: Of noise, tiles and push.
+    """
 
     height: float = 0.0
-    """Every box is higher by this."""
     unevenness: float = 0.0
-    """Tops are warped: tiles whose heights are off by up to this, by `seed`."""
     roll: float = 0.0
-    """Boxes are tilted by this about x, through the middle of their near edge."""
     pitch: float = 0.0
-    """Boxes are tilted by this about their near edge; positive: the far end sinks."""
     friction: float | None = None
-    """Of ground and boxes; none: as in the scene."""
     x: float = 0.0
-    """The robot starts off by this."""
     y: float = 0.0
-    """The robot starts off by this."""
     yaw: float = 0.0
-    """The robot starts turned by this."""
     mass: float = 1.0
-    """Factor on the masses and inertias of all links."""
     effort: float = 1.0
-    """Factor on the effort limits of all joints."""
     delay: float = 0.002
-    """From sensing to command [s]; whole milliseconds."""
     noise: float = 1.0
-    """Factor on the noise of the sensors."""
     push: float = 0.0
-    """On the pelvis for 0.2 s, horizontal; its time and direction by `seed`."""
     seed: int = 0
-    """Of noise, tiles and push."""
 
     def __post_init__(self) -> None:
         """Check every value.

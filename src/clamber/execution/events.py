@@ -8,10 +8,13 @@ from typing import Any, ClassVar
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that was measured or done, at a time [s] of the run.
+    """Something that was measured or done.
 
     Lengths are in metres, angles in radians. `says` is the sentence, its fields filled
     in by `str`.
+
+    Attributes:
+        time: Of the run [s].
     """
 
     says: ClassVar[str]

@@ -21,8 +21,10 @@ from clamber.execution.perturbed import perturbed_world, push_of
 from clamber.execution.reference import STEPS
 from clamber.execution.sensors import BLOCK, Sensors
 from clamber.execution.servo import ControlMode, driven_world
+from clamber.model.arguments import checks_types
 from clamber.model.records import short_repr
-from clamber.model.scene import Scene
+from clamber.model.shown import Viewed
+from clamber.model.terrain import SceneLike, load_scene
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
@@ -36,7 +38,7 @@ DEFAULT_CONTROLLER: ControlMode = "mixed"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Rollout:
+class Rollout(Viewed):
     """What physics did, as measured.
 
     Commands are multiples of a microradian; states and forces have single precision.
@@ -47,7 +49,8 @@ class Rollout:
         world: The one that physics ran.
         ctrl: (N, nu) commands, one for each step.
         stride: Steps between two recorded states.
-        time: (M,) [s]; qpos (M, nq), qvel (M, nv): the state BEFORE steps 0, stride ...
+        time: (M,) [s] BEFORE steps 0, stride ...
+        qpos, qvel: (M, nq), (M, nv) the state then.
         actuator_force: (M, nu) [N m]; contact_force: (M, nS, 3) [N] on each surface, in
             the world; unintended: (M,) normal force on other links [N].
         surfaces: Names of the nS surfaces.
@@ -61,6 +64,7 @@ class Rollout:
         events: What was measured on the way, and what was done about it.
         fell: The run ended at once because the robot fell.
         rests_on: Surfaces in contact at the end, as executed, by `surface@support`.
+        plan: What was to be done; None where it was read from disk.
     """
 
     world: World
@@ -83,6 +87,7 @@ class Rollout:
     events: tuple[Event, ...] = ()
     fell: bool = False
     rests_on: tuple[str, ...] = ()
+    plan: Plan | None = None
 
     __repr__ = short_repr
 
@@ -92,12 +97,13 @@ class Rollout:
         return next((e.why for e in self.events if isinstance(e, Stopped)), "")
 
 
+@checks_types
 def simulate(
     plan: Plan,
     *,
     controller: ControlMode = DEFAULT_CONTROLLER,
     disturbance: Disturbance | None = None,
-    true_scene: Scene | None = None,
+    true_scene: SceneLike | None = None,
     progress: Callable[[str, float, str], None] | None = None,
 ) -> Rollout:
     """Run the trajectory of a plan in MuJoCo.
@@ -124,7 +130,8 @@ def simulate(
             field="disturb.x, y, yaw",
             value=(d.x, d.y, d.yaw),
         )
-    world = driven_world(perturbed_world(plan.world, d, true_scene), controller)
+    truth = None if true_scene is None else load_scene(true_scene)
+    world = driven_world(perturbed_world(plan.world, d, truth), controller)
     follower = (OpenLoop if controller == "pid" else Executive)(plan, world)
     rng = np.random.default_rng([d.seed, 1])
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
@@ -175,6 +182,7 @@ def simulate(
         events=tuple(follower.events),
         fell=loop.fell,
         rests_on=follower.rests_on,
+        plan=plan,
     )
 
 

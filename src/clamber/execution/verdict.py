@@ -13,10 +13,12 @@ import numpy as np
 
 from clamber.contact.steps import on_feet
 from clamber.execution.simulation import END, Rollout
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.scene import GROUND
 from clamber.model.se3 import upward, wrap, yaw_of
+from clamber.model.shown import Shown
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.records import Plan
 from clamber.step.stability import STANDING_SHARE, standing_share
@@ -57,7 +59,13 @@ class Figure(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Criterion:
-    """One figure with its limit."""
+    """One figure with its limit.
+
+    Attributes:
+        value: In the unit that the figure's name says.
+        limit: The least or the most that is well, in the same unit.
+        ok: Whether it is.
+    """
 
     value: float
     limit: float
@@ -65,8 +73,13 @@ class Criterion:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Verdict:
-    """Whether physics got the robot there, and by which figures."""
+class Verdict(Shown):
+    """Whether physics got the robot there, and by which figures.
+
+    Attributes:
+        reached: Every criterion is met.
+        criteria: By figure.
+    """
 
     reached: bool
     criteria: dict[Figure, Criterion]
@@ -163,6 +176,7 @@ def self_penetration(world: World, qpos: np.ndarray) -> tuple[float, str]:
     return worst, pair
 
 
+@checks_types
 def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdict:
     """Did the robot end where the plan says, on what it planned to rest on?
 

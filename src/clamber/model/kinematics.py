@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from clamber import _core
+from clamber.model.arguments import checks_types
 from clamber.model.core import core_of, near_pairs
 from clamber.model.records import short_repr
 from clamber.model.world import World
@@ -187,8 +188,13 @@ class Kinematics:
         return out
 
 
+@checks_types
 def limb_lengths(kin: Kinematics) -> dict[str, float]:
-    """Segment lengths of the robot by the names of a subject's [m]."""
+    """Segment lengths of the robot by the names of a subject's [m].
+
+    Args:
+        kin: Of its world, in any posture.
+    """
     out: dict[str, list[float]] = {}
     for limb in kin.world.robot.limbs.values():
         a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))

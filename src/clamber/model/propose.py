@@ -20,6 +20,7 @@ import yaml
 from scipy.optimize import least_squares
 
 from clamber.errors import InputError, read_yaml, validated
+from clamber.model.arguments import checks_types
 from clamber.model.description import (
     Description,
     compile_description,
@@ -83,6 +84,7 @@ class Proposal:
     __repr__ = short_repr
 
 
+@checks_types
 def propose_robot(
     path: str | Path, *, effort_from: str | Path | None = None
 ) -> Proposal:

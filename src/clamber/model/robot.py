@@ -16,6 +16,7 @@ import numpy as np
 import pydantic
 
 from clamber.errors import InputError, read_yaml, validated
+from clamber.model.arguments import checks_types
 from clamber.model.description import Description, compile_description, read_description
 from clamber.model.records import short_repr
 
@@ -88,6 +89,7 @@ class Robot:
     """A humanoid as its files describe it.
 
     Attributes:
+        name: For people.
         path: The MJCF or URDF file.
         base: Name of the pelvis body.
         home: Joint angles of the posture it starts from [rad].
@@ -128,12 +130,21 @@ class Robot:
         raise KeyError(f"no surface {surface!r}; there are {list(self.surfaces)}")
 
 
-def load_robot(name_or_path: str | Path) -> Robot:
+RobotLike = Robot | str | Path  # a robot, or what `load_robot` makes one of
+
+
+@checks_types
+def load_robot(name_or_path: RobotLike) -> Robot:
     """Read a built-in robot by name, or a `robot.yaml`.
+
+    Args:
+        name_or_path: Such as `coman`, or the file; a `Robot` is returned as it is.
 
     Raises:
         InputError: No such robot, or a field of its file cannot be used.
     """
+    if isinstance(name_or_path, Robot):
+        return name_or_path
     path, given = Path(name_or_path), str(name_or_path)
     if not path.suffix:
         known = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))

@@ -230,10 +230,16 @@ class Support:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Box:
-    """A box obstacle: full lengths, centre and rotation in the world.
+    """A box obstacle.
 
-    Its faces are uneven by about `roughness` [m]: what is no contact keeps so much more
-    distance from them.
+    Attributes:
+        name: Of the support that its top is.
+        size: (3,) full lengths [m].
+        position: (3,) centre in the world [m].
+        rotation: (3, 3) of the box in the world.
+        friction: Coulomb coefficient of its faces.
+        roughness: Its faces are uneven by about this [m]: what is no contact keeps so
+            much more distance from them.
     """
 
     name: str

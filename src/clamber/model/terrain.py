@@ -16,6 +16,7 @@ import numpy as np
 import pydantic
 
 from clamber.errors import InputError, read_yaml, unreadable, validated
+from clamber.model.arguments import checks_types
 from clamber.model.description import compile_description, read_description
 from clamber.model.scene import GROUND, MAX_LENGTH, Box, Scene, finite, length
 from clamber.model.se3 import matrix_from_rpy
@@ -111,12 +112,24 @@ class SceneFile(_Strict):
         )
 
 
-def load_scene(path: str | Path) -> Scene:
+SceneLike = Scene | float | str | Path  # a scene, or what `load_scene` makes one of
+
+
+@checks_types
+def load_scene(path: SceneLike) -> Scene:
     """Read a `scene.yaml`, or the boxes of an OBJ or MJCF (`.xml`).
 
+    Args:
+        path: The file; or the height [m] of one box, see `Scene.from_height`; a `Scene`
+            is returned as it is.
+
     Raises:
-        InputError: The file or one of its fields cannot be used.
+        InputError: The file, one of its fields, or the height cannot be used.
     """
+    if isinstance(path, Scene):
+        return path
+    if not isinstance(path, str | Path):
+        return Scene.from_height(float(path))
     path = Path(path)
     drawn = path.suffix.lower() in DRAWN
     content = {"boxes": path.name} if drawn else read_yaml(path)

@@ -18,11 +18,13 @@ import mujoco
 import numpy as np
 
 from clamber.errors import InputError
+from clamber.model.arguments import checks_types
 from clamber.model.description import read_description
 from clamber.model.records import short_repr
-from clamber.model.robot import Robot, has_prefix, world_name
+from clamber.model.robot import Robot, RobotLike, has_prefix, load_robot, world_name
 from clamber.model.scene import GROUND, Scene, Support
 from clamber.model.se3 import matrix_from_quat, quat_from_yaw
+from clamber.model.terrain import SceneLike, load_scene
 
 PHYSICS_STEP = 0.001  # [s]
 SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
@@ -74,16 +76,26 @@ class World:
     """Robot and scene as one compiled model, with indices and limits.
 
     Attributes:
+        model: Compiled, at the physics step.
         xml: The MJCF text, geoms of surfaces renamed to begin with the surface's name.
+        robot: As its files describe it.
+        scene: That it stands in.
         home: (nq,) standing at the scene's start, soles on the ground.
+        surfaces: By name.
+        edges: Of a flat surface, the four that it may roll onto.
+        joints: (na,) names of the actuated ones.
+        qadr, dadr: (na,) their indices in q and v.
         q_min, q_max: (nv,) joint limits aligned with `v`; infinite for the base.
-        tau_max: (na,) effort limits; joints: (na,) names.
-        qadr, dadr: (na,) indices of the actuated joints in q and v.
+        tau_max: (na,) effort limits [N m].
+        kp, kd, ki: (na,) servo gains [N m/rad], [N m s/rad], [N m/(rad s)].
         pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
         support_geom: Geom of each support; support_of_geom: the other way, with the
             tiles of an uneven top.
+        supports: By name.
         touching: By surface and support, the pairs that touch in their contact: those
             that plan it, and those of the surface's further geoms.
+        base: Id of the pelvis body.
+        mass: Of the whole robot [kg].
     """
 
     model: mujoco.MjModel
@@ -127,12 +139,21 @@ class World:
         return int(self.model.geom_bodyid[g]), self.model.geom_pos[g].copy()
 
 
-def build_world(robot: Robot, scene: Scene) -> World:
+@checks_types
+def build_world(robot: RobotLike, scene: SceneLike) -> World:
     """Compile robot and scene into one model, the robot standing at the start.
 
     Actuators of the description are replaced by one joint servo per hinge, saturated at
     its effort limit. Supports have contact priority, so that their friction counts.
+
+    Args:
+        robot: A robot, its name, or its `robot.yaml`.
+        scene: A scene, its file, or the height of one box [m].
+
+    Raises:
+        InputError: The robot or the scene cannot be used.
     """
+    robot, scene = load_robot(robot), load_scene(scene)
     spec = read_description(robot.path).spec
     _prepare_robot(spec, robot)
     spec.option.timestep = PHYSICS_STEP

@@ -8,11 +8,13 @@ import mujoco
 import numpy as np
 
 from clamber.errors import InputError
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics, limb_lengths
 from clamber.model.limbs import DENSEST, geom_volume
 from clamber.model.records import short_repr
-from clamber.model.robot import Robot
+from clamber.model.robot import RobotLike, load_robot
 from clamber.model.scene import Box, Scene
+from clamber.model.terrain import SceneLike, load_scene
 from clamber.model.world import World, build_world
 from clamber.step.change import standing
 from clamber.step.ik import IK
@@ -52,12 +54,17 @@ class Checkup:
     __repr__ = short_repr
 
 
-def check_robot(robot: Robot) -> Checkup:
+@checks_types
+def check_robot(robot: RobotLike) -> Checkup:
     """Stand the robot up alone and look at it.
+
+    Args:
+        robot: A robot, its name, or its `robot.yaml`.
 
     Raises:
         InputError: Its files cannot be used at all.
     """
+    robot = load_robot(robot)
     world = build_world(robot, Scene(start=np.zeros(3)))
     kin = Kinematics(world)
     kin.update(world.home)
@@ -177,13 +184,17 @@ def _geometry_faults(world: World) -> list[str]:
     return out
 
 
-def check_scene(scene: Scene) -> dict[str, str]:
+@checks_types
+def check_scene(scene: SceneLike) -> dict[str, str]:
     """What is wrong with each support, by name; those without a fault are left out.
 
     A top steeper than its friction bears nothing, one below the ground is not there,
     one inside another box cannot be stood on, and none may be where the robot starts.
+
+    Args:
+        scene: A scene, its file, or the height of one box [m].
     """
-    out = {}
+    scene, out = load_scene(scene), {}
     for s in scene.supports[1:]:
         slope = float(np.arccos(np.clip(s.normal[2], -1.0, 1.0)))
         corners = s.position + s.polygon @ s.rotation[:, :2].T

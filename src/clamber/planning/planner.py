@@ -23,9 +23,11 @@ from clamber.contact.policy import GeneralPolicy
 from clamber.contact.scaling import retarget
 from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
+from clamber.model.arguments import checks_types
 from clamber.model.records import short_repr
-from clamber.model.robot import Robot
+from clamber.model.robot import RobotLike, load_robot
 from clamber.model.scene import Scene
+from clamber.model.terrain import SceneLike, load_scene
 from clamber.model.world import build_world
 from clamber.planning.demonstrated import VARIATIONS, follow_steps
 from clamber.planning.diagnose import check_reach, check_start
@@ -113,10 +115,11 @@ class Replanned:
         return self.ranked[0]
 
 
+@checks_types
 def plan(
     goal: ContactSequence | GeneralPolicy,
-    robot: Robot,
-    scene: Scene,
+    robot: RobotLike,
+    scene: SceneLike,
     *,
     start: Start | None = None,
     options: PlanOptions | None = None,
@@ -130,8 +133,9 @@ def plan(
 
     Args:
         goal: What a person has done; or a policy, which leads to the scene's goal.
-        robot: Robot.
-        scene: Where it is; from the middle of a climb, as it is believed to be.
+        robot: A robot, its name, or its `robot.yaml`.
+        scene: Where it is, its file, or the height of one box [m]; from the middle of a
+            climb, as it is believed to be.
         start: Where the robot is, in the middle of a climb, or the keyframe to go on
             from; None: it stands where the scene says. From the middle, where there is
             no way at the distance that roughness or `clearance` asks for, that is not
@@ -149,7 +153,7 @@ def plan(
         InputError: The scene does not fit the sequence or the policy, or is out of the
             robot's reach; the robot cannot stand there.
     """
-    options = _checked(options)
+    options, robot, scene = _checked(options), load_robot(robot), load_scene(scene)
     report, budget = progress or silent, budget or Budget()
 
     def task(scene: Scene, clearance: ExtraClearance) -> _Task:
@@ -170,10 +174,11 @@ def plan(
     return here.timed(found)
 
 
+@checks_types
 def replan(
     sequence: ContactSequence,
-    robot: Robot,
-    scene: Scene,
+    robot: RobotLike,
+    scene: SceneLike,
     *,
     options: PlanOptions | None = None,
     budget: Budget | None = None,
@@ -184,8 +189,8 @@ def replan(
 
     Args:
         sequence: As demonstrated.
-        robot: Robot.
-        scene: Where it climbs.
+        robot: A robot, its name, or its `robot.yaml`.
+        scene: Where it climbs, its file, or the height of one box [m].
         options: How each is planned.
         budget: Of the search.
         counts: As in `plan`.

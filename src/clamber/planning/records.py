@@ -13,6 +13,7 @@ from clamber.contact.policy import GeneralPolicy
 from clamber.contact.steps import Skipped, Step
 from clamber.errors import InputError
 from clamber.model.records import frozen_array, short_repr
+from clamber.model.shown import Viewed
 from clamber.model.world import World
 from clamber.planning.trajectory import Trajectory
 from clamber.step.change import Change, Failure
@@ -252,7 +253,7 @@ class Fallback:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Plan:
+class Plan(Viewed):
     """Everything that planning found.
 
     Attributes:

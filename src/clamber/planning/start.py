@@ -15,9 +15,11 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.contact.steps import Step, split_steps
 from clamber.errors import InputError, Status
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
-from clamber.model.scene import GROUND, Scene
+from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_matrix
+from clamber.model.terrain import SceneLike
 from clamber.model.world import World, build_world
 from clamber.planning.records import Plan, PlanOptions, State
 from clamber.step.change import standing
@@ -98,9 +100,10 @@ def settle(
     return key, lead
 
 
+@checks_types
 def state_of(
     plan: Plan,
-    scene: Scene,
+    scene: SceneLike,
     q: np.ndarray,
     touching: Mapping[str, str] | None = None,
     *,

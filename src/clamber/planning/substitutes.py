@@ -23,9 +23,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.robot import Robot
+from clamber.model.robot import Robot, RobotLike, load_robot
 from clamber.model.scene import GROUND
 from clamber.planning.records import Plan
 from clamber.step.statics import projected_distance
@@ -46,8 +47,13 @@ class Alternative:
     __repr__ = short_repr
 
 
+@checks_types
 def contact_differences(sequence: ContactSequence) -> tuple[tuple[str, ...], ...]:
-    """Surfaces of each stance after the first that the first has not: Cd_i."""
+    """Surfaces of each stance after the first that the first has not: Cd_i.
+
+    Args:
+        sequence: As demonstrated.
+    """
     first = set(sequence.stances[0].surfaces)
     return tuple(
         tuple(s for s in stance.surfaces if s not in first)
@@ -55,15 +61,17 @@ def contact_differences(sequence: ContactSequence) -> tuple[tuple[str, ...], ...
     )
 
 
+@checks_types
 def contact_alternatives(
-    sequence: ContactSequence, robot: Robot
+    sequence: ContactSequence, robot: RobotLike
 ) -> tuple[Alternative, ...]:
     """One for each combination of surfaces, of the limbs that offer several at once.
 
     Args:
         sequence: As demonstrated.
-        robot: Whose limbs have the surfaces; others are nobody's.
+        robot: Whose limbs have the surfaces, or its name; others are nobody's.
     """
+    robot = load_robot(robot)
     differences = contact_differences(sequence)
     offers = []
     for limb in robot.limbs.values():
@@ -151,12 +159,16 @@ def without_surfaces(
     )
 
 
+@checks_types
 def plan_cost(made: Plan) -> float:
     """Way of the surfaces to their contacts, and projected distances, summed [m].
 
     The way is the straight line from where a surface is before the move, the shortest
     that there is. A step that has no path counts with what is wanted of it, from the
     last keyframe.
+
+    Args:
+        made: The plan, whole or not.
     """
     world = made.world
     kin = Kinematics(world)

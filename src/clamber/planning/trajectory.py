@@ -86,8 +86,8 @@ class Trajectory:
         time: (T,) [s]; q: (T, nq); v: (T, nv) the derivative of q on the manifold.
         tau: (T, na) feed-forward joint torques [N m]. As planned, these three are
             sampled when they are asked for.
-        contact: (T, nS) bool, closed contacts by `surfaces`.
-        joints: (na,) names.
+        contact: (T, nS) bool, closed contacts.
+        surfaces, joints: (nS,), (na,) names.
         keyframes: (K,) time at which each keyframe is reached [s].
         segments: What the samples are part of, in order; empty where nobody knows.
     """

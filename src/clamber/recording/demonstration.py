@@ -19,6 +19,7 @@ from clamber.contact.contact import PARTS
 from clamber.errors import InputError
 from clamber.model.records import short_repr
 from clamber.model.scene import Box, Scene, Support
+from clamber.model.shown import Shown
 
 SIDES = ("L", "R")
 LANDMARKS = ("LShoulder", "RShoulder", "LHip", "RHip", "Pelvis")
@@ -39,7 +40,7 @@ class Gap:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Demonstration:
+class Demonstration(Shown):
     """A person's motion among boxes.
 
     Attributes:

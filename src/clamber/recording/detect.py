@@ -30,9 +30,11 @@ from clamber.contact.contact import (
     Stance,
 )
 from clamber.errors import InputError
+from clamber.model.arguments import checks_types
 from clamber.model.records import short_repr
 from clamber.model.scene import Scene, Support
 from clamber.model.se3 import frame_from_normal, quat_from_matrix
+from clamber.model.terrain import SceneLike, load_scene
 from clamber.recording.demonstration import (
     SIDES,
     Demonstration,
@@ -148,10 +150,11 @@ class _Tracks:
         return round(seconds * self.demo.rate)
 
 
+@checks_types
 def detect_contacts(
     demo: Demonstration,
     *,
-    scene: Scene | None = None,
+    scene: SceneLike | None = None,
     options: DetectOptions | None = None,
 ) -> ContactSequence:
     """Find contacts and the stances that they make [thesis 5.1, algorithm 1].
@@ -167,7 +170,7 @@ def detect_contacts(
     Raises:
         InputError: Nothing is in contact at any time.
     """
-    scene = scene or demo.scene
+    scene = demo.scene if scene is None else load_scene(scene)
     tracks = _smooth(demo, scene, options or DetectOptions())
     seats = _find_seats(tracks)
     near = {p: _nearness(tracks, p, seats) for p in _evidence(demo)}

@@ -19,9 +19,10 @@ import numpy as np
 import pydantic
 
 from clamber.errors import InputError, read_yaml, unreadable, validated
+from clamber.model.arguments import checks_types
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_quat
-from clamber.model.terrain import load_scene, read_obj, to_z_up
+from clamber.model.terrain import SceneLike, load_scene, read_obj, to_z_up
 from clamber.recording import arrays, bvh, c3d, motive, trc
 from clamber.recording.built_in import BUILT_IN, load_built_in
 from clamber.recording.demonstration import (
@@ -126,10 +127,11 @@ class RecordingFile(pydantic.BaseModel):
         return offsets
 
 
+@checks_types
 def load_demo(
     path_or_name: str | Path,
     *,
-    scene: Scene | None = None,
+    scene: SceneLike | None = None,
     names: str | Path | Sequence[str] | None = None,
     rate: float | None = None,
     span: tuple[float, float] | None = None,
@@ -165,7 +167,8 @@ def load_demo(
                 names = list(names)
             given = {"file": path.name, "names": names, "rate": rate}
         said = validated(RecordingFile, given, path)
-        demo = _build(path, said, scene, span or said.span)
+        given = None if scene is None else load_scene(scene)
+        demo = _build(path, said, given, span or said.span)
     else:
         expected = (
             f"one of the built-in demonstrations {list(BUILT_IN)} or a file "

@@ -21,6 +21,7 @@ import numpy as np
 
 from clamber.errors import InputError, MissingDependency
 from clamber.execution.simulation import Rollout
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
@@ -81,6 +82,7 @@ class Exported:
     forces: bool
 
 
+@checks_types
 def export_run(
     folder: str | Path,
     *,

@@ -28,6 +28,7 @@ from clamber.errors import InputError, unreadable
 from clamber.execution.reference import in_steps
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
 from clamber.model.propose import Proposal, robot_yaml
 from clamber.model.robot import Robot
@@ -75,7 +76,7 @@ VERSIONS_OF = ("clamber", "mujoco", "numpy", "scipy", "daqp")
 _NOT_IN_PLAN = ("world", "trajectory", "timings", "start", "changes")
 _OF_RUNS = ("q", "v", "tau")  # what is sampled of a planned trajectory
 _IN_EXECUTION = ("events", "fell", "rests_on")
-_NOT_IN_ROLLOUT = ("world", "followed", *_IN_EXECUTION)
+_NOT_IN_ROLLOUT = ("world", "followed", "plan", *_IN_EXECUTION)
 _NOT_IN_EXECUTION = tuple(
     f.name for f in fields(Rollout) if f.name not in _IN_EXECUTION
 )
@@ -84,7 +85,8 @@ _NOT_IN_EXECUTION = tuple(
 # Folders.
 
 
-def new_run_folder(out: Path | None, command: str) -> Path:
+@checks_types
+def new_run_folder(out: str | Path | None, command: str) -> Path:
     """Make the folder of a run.
 
     Args:
@@ -138,13 +140,23 @@ def _read(path: Path, *, versions: Collection[int] = (VERSION,)) -> At:
 # Sequences and policies, alone.
 
 
+@checks_types
 def save_sequence(sequence: ContactSequence, path: str | Path) -> None:
-    """Write `sequence.json`."""
+    """Write `sequence.json`.
+
+    Args:
+        sequence: At the person's scale, as detected.
+        path: The file.
+    """
     write_json(Path(path), CODEC.encode(sequence))
 
 
+@checks_types
 def load_sequence(path: str | Path) -> ContactSequence:
     """Read a `sequence.json`, or that of a run folder.
+
+    Args:
+        path: The file or the folder.
 
     Raises:
         InputError: The file or one of its fields cannot be used.
@@ -162,13 +174,23 @@ def policy_summary(policy: GeneralPolicy) -> dict[str, Any]:
     }
 
 
+@checks_types
 def save_policy(policy: GeneralPolicy, path: str | Path) -> None:
-    """Write `policy.json`: the general policy and the demo policies behind it."""
+    """Write `policy.json`: the general policy and the demo policies behind it.
+
+    Args:
+        policy: As learned.
+        path: The file.
+    """
     write_json(Path(path), CODEC.encode(policy))
 
 
+@checks_types
 def load_policy(path: str | Path) -> GeneralPolicy:
     """Read a `policy.json`, or that of a folder.
+
+    Args:
+        path: The file or the folder.
 
     Raises:
         InputError: The file or one of its fields cannot be used.
@@ -180,11 +202,16 @@ def load_policy(path: str | Path) -> GeneralPolicy:
 # Plans.
 
 
+@checks_types
 def save_plan(plan: Plan, folder: str | Path) -> None:
     """Write a plan, and the scene and the trajectory that are to run.
 
     Results that the folder holds of an earlier plan are removed. `plan.json` comes
     last: where it is, the others are.
+
+    Args:
+        plan: Complete or not.
+        folder: That exists, see `new_run_folder`.
     """
     folder = Path(folder)
     for name in (*_OF_A_PLAN, *_OF_A_RUN):
@@ -226,6 +253,7 @@ def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
     return out
 
 
+@checks_types
 def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
     """Read what `save_plan` wrote: the same plan.
 
@@ -440,8 +468,14 @@ def _with_assets(root: ElementTree.Element, base: Path) -> dict[bytes, str]:
     return names
 
 
+@checks_types
 def save_proposal(proposal: Proposal, folder: str | Path) -> None:
-    """Write `robot.yaml`, the model that it names, and meshes into a folder."""
+    """Write `robot.yaml`, the model that it names, and meshes into a folder.
+
+    Args:
+        proposal: Of a robot.
+        folder: That exists.
+    """
     files = {f"{MESH_FOLDER}/{n}": content for n, content in proposal.files.items()}
     files[proposal.fields["model"]] = proposal.mjcf.encode()
     files[ROBOT] = robot_yaml(proposal).encode()
@@ -472,8 +506,15 @@ def save_replanned(found: Replanned, folder: str | Path) -> None:
 # Rollouts and verdicts.
 
 
+@checks_types
 def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
-    """Write what physics did, and what it ran: the world and what was last followed."""
+    """Write what physics did, and what it ran: the world and what was last followed.
+
+    Args:
+        plan: That was to be done, as `save_plan` wrote it there.
+        rollout: Of that plan.
+        folder: The run folder.
+    """
     folder = Path(folder)
     _save_world(rollout.world, folder / SCENE)
     followed = rollout.followed or in_steps(trajectory_of(plan, folder))
@@ -491,6 +532,7 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     )
 
 
+@checks_types
 def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
     """Read what `save_rollout` wrote.
 
@@ -534,8 +576,14 @@ def _execution_of(at: At) -> dict[str, Any]:
     return CODEC.fields(Rollout, at, without=_NOT_IN_EXECUTION)
 
 
+@checks_types
 def save_verdict(verdict: Verdict, folder: str | Path) -> None:
-    """Write `verdict.json`."""
+    """Write `verdict.json`.
+
+    Args:
+        verdict: Of a rollout.
+        folder: The run folder.
+    """
     write_json(Path(folder) / VERDICT, CODEC.encode(verdict))
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from clamber.contact.contact import ContactSequence
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.execution.simulation import Rollout
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
-from clamber.model.scene import Scene
+from clamber.model.terrain import SceneLike
 from clamber.planning.records import Plan
 from clamber.recording.built_in import BUILT_IN, source_of
 from clamber.recording.detect import detect_contacts
@@ -41,11 +42,12 @@ LAYERS = {  # name in the page: shown at first
 }
 
 
+@checks_types
 def open_view(
     source: str | Path,
     *,
     demo: str | Path | None = None,
-    scene: Scene | None = None,
+    scene: SceneLike | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Page:
@@ -87,7 +89,7 @@ def open_view(
 
 
 def _open_run(
-    folder: Path, demo: str | Path | None, scene: Scene | None, host: str, port: int
+    folder: Path, demo: str | Path | None, scene: SceneLike | None, host: str, port: int
 ) -> Page:
     """The page of a run folder: of its motion, else of its recording, else of words."""
     run = read_run(folder)

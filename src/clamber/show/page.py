@@ -141,6 +141,15 @@ class Page:
         name = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
         return f"http://{f'[{name}]' if ':' in name else name}:{self.port}"
 
+    def __repr__(self) -> str:
+        """Where it is."""
+        return f"Page({self.url})"
+
+    def _repr_html_(self) -> str:
+        """The page itself, in a notebook."""
+        look = "width: 100%; height: 600px; border: 0"
+        return f'<iframe src="{self.url}" style="{look}"></iframe>'
+
     def close(self) -> None:
         """Stop serving."""
         self._stopped.set()

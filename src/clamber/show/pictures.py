@@ -13,9 +13,11 @@ from clamber.contact.contact import ContactSequence
 from clamber.contact.steps import Step
 from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
-from clamber.model.robot import Robot
+from clamber.model.robot import RobotLike
 from clamber.model.scene import GROUND, Scene
+from clamber.model.terrain import SceneLike
 from clamber.model.world import World, build_world
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
@@ -68,12 +70,21 @@ CLOSE = 0.12  # [height of the motion] around it boxes are in a sheet's pictures
 TILE = (400, 330)  # of the sheet of keyframes
 
 
+@checks_types
 def draw_robot(
-    robot: Robot, path: str | Path, *, tile: tuple[int, int] = (560, 640)
+    robot: RobotLike, path: str | Path, *, tile: tuple[int, int] = (560, 640)
 ) -> Path:
     """Draw the robot as it stands, from behind and from ahead, its surfaces named.
 
     A dot marks where each surface touches, a ring the mass that its limb supports.
+
+    Args:
+        robot: A robot, its name, or its `robot.yaml`.
+        path: The PNG file.
+        tile: Width and height of each of the two views [px].
+
+    Raises:
+        ClamberError: There is no OpenGL.
     """
     world = build_world(robot, Scene(start=np.zeros(3)))
     kin = Kinematics(world)
@@ -99,11 +110,27 @@ def draw_robot(
     return _save_sheet(tiles, path, columns=2)
 
 
+@checks_types
 def draw_scene(
-    robot: Robot, scene: Scene, path: str | Path, *, tile: tuple[int, int] = (760, 560)
+    robot: RobotLike,
+    scene: SceneLike,
+    path: str | Path,
+    *,
+    tile: tuple[int, int] = (760, 560),
 ) -> Path:
-    """Draw a scene with the robot at its start, its supports named, the goal marked."""
+    """Draw a scene with the robot at its start, its supports named, the goal marked.
+
+    Args:
+        robot: A robot, its name, or its `robot.yaml`.
+        scene: A scene, its file, or the height of one box [m].
+        path: The PNG file.
+        tile: Width and height [px].
+
+    Raises:
+        ClamberError: There is no OpenGL.
+    """
     world = build_world(robot, scene)
+    robot, scene = world.robot, world.scene
     kin = Kinematics(world)
     kin.update(world.home)
     tops = [s for s in scene.supports if s.name != GROUND]
@@ -237,6 +264,7 @@ def _save_sheet(
     return path
 
 
+@checks_types
 def render_run(
     folder: str | Path,
     *,

@@ -33,6 +33,7 @@ from PIL import Image
 
 from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
+from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
 from clamber.planning.records import Plan
 from clamber.run.codec import whole_file
@@ -69,6 +70,7 @@ class Reported:
     missing: tuple[str, ...]
 
 
+@checks_types
 def write_report(
     folder: str | Path,
     *,

@@ -22,6 +22,8 @@ from clamber.execution.events import Replanned
 from clamber.execution.servo import ControlMode
 from clamber.execution.simulation import DEFAULT_CONTROLLER, simulate
 from clamber.execution.verdict import Figure, judge
+from clamber.model.arguments import checks_types
+from clamber.model.records import short_repr
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.model.terrain import load_scene
@@ -62,6 +64,8 @@ class Climb:
     contacts: Contacts = "any"
     search: Budget = field(default_factory=Budget)
     disturb: Disturbance = field(default_factory=Disturbance)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         """Check that there is one scene.
@@ -152,11 +156,15 @@ def scene_of(height: float | None, path: str | Path | None) -> Scene:
         raise InputError(e.expected, "--height", value=height) from e
 
 
+@checks_types
 def run_climb(climb: Climb) -> ClimbResult:
     """Detect, plan, simulate, judge.
 
     A scene out of the robot's reach and a plan that misses a step are results: the
     robot does not get there. An incomplete plan is not simulated.
+
+    Args:
+        climb: Recording, robot, scene and how.
     """
     try:
         # One process does many climbs that differ in their disturbances alone.

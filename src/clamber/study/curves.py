@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from clamber.model.arguments import checks_types
 from clamber.run.codec import whole_file
 from clamber.run.figures import finish_axes, save_plot
 from clamber.study.climb import ClimbResult
@@ -130,8 +131,16 @@ def fit_strand(spec: Spec, strand: Strand, rows: Rows) -> Break | None:
     return fit_break(share, [outcome.reached for _, outcome in mine])
 
 
-def save_curves(spec: Spec, rows: Rows, folder: Path) -> list[Path]:
-    """Write `summary.csv`, `curve.csv` and `success.png`."""
+@checks_types
+def save_curves(spec: Spec, rows: Rows, folder: str | Path) -> list[Path]:
+    """Write `summary.csv`, `curve.csv` and `success.png`.
+
+    Args:
+        spec: Of the sweep.
+        rows: That are finished.
+        folder: That exists.
+    """
+    folder = Path(folder)
     tables = {SUMMARY: summarise(spec, rows), CURVE: bins(spec, rows)}
     for name, records in tables.items():
         kind = Summary if name == SUMMARY else Bin

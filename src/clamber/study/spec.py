@@ -20,6 +20,7 @@ import pydantic
 
 from clamber.errors import InputError, input_error, read_yaml
 from clamber.execution.servo import ControlMode
+from clamber.model.arguments import checks_types
 from clamber.study.climb import FLAGS, Climb, ClimbResult, climb_of
 
 SEED = "disturb.seed"
@@ -234,6 +235,10 @@ class Spec(_Strict):
             )
         return self
 
+    def __repr__(self) -> str:
+        """What it asks, and what it varies."""
+        return f"Spec(about={self.about!r:.80}, flags={', '.join(self.flags)!r:.80})"
+
     @property
     def flags(self) -> list[str]:
         """Flags that differ between runs, the seed aside."""
@@ -283,8 +288,12 @@ class Run:
     job: Climb
 
 
+@checks_types
 def load_spec(path: str | Path) -> Spec:
     """Read a spec; files that it names may lie beside it.
+
+    Args:
+        path: The YAML file.
 
     Raises:
         InputError: The file or one of its fields cannot be used.

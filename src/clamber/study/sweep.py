@@ -25,6 +25,7 @@ from typing import IO, Any
 import yaml
 
 from clamber.errors import ClamberError, InputError, MissingDependency, unreadable
+from clamber.model.arguments import checks_types
 from clamber.model.robot import load_robot
 from clamber.model.terrain import load_scene
 from clamber.recording.recording import load_demo
@@ -82,9 +83,10 @@ class Pace:
         return self.motion / max(self.busy, 1e-9)
 
 
+@checks_types
 def run_sweep(
     spec: Spec,
-    folder: Path,
+    folder: str | Path,
     *,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -111,6 +113,7 @@ def run_sweep(
         ClamberError: Workers die again and again.
     """
     report = progress or (lambda stage, share, note: None)
+    folder = Path(folder)
     with _table(spec, folder) as table:
         todo = _Todo(spec, table.done)
         report(
@@ -432,12 +435,17 @@ def read_outcomes(spec: Spec, text: str, source: Path) -> dict[str, ClimbResult]
     return out
 
 
-def load_sweep(folder: Path) -> tuple[Spec, Rows]:
+@checks_types
+def load_sweep(folder: str | Path) -> tuple[Spec, Rows]:
     """Spec and finished rows of a sweep, also of one that is not done.
+
+    Args:
+        folder: That `run_sweep` writes.
 
     Raises:
         InputError: There is none.
     """
+    folder = Path(folder)
     spec, path = load_spec(folder / SPEC), folder / TABLE
     try:
         text = path.read_text()
