@@ -23,6 +23,9 @@ SHAPES = (
     mujoco.mjtGeom.mjGEOM_MESH,
 )
 _MODELS: WeakKeyDictionary[World, _core.Model] = WeakKeyDictionary()
+_NUMBERS: WeakKeyDictionary[World, tuple[dict[str, int], dict[str, int]]] = (
+    WeakKeyDictionary()
+)
 
 
 def core_of(world: World) -> _core.Model:
@@ -30,6 +33,15 @@ def core_of(world: World) -> _core.Model:
     if world not in _MODELS:
         _MODELS[world] = _core.Model(_constants(world))
     return _MODELS[world]
+
+
+def numbers_of(world: World) -> tuple[dict[str, int], dict[str, int]]:
+    """By name, which surface and which support it is to the core."""
+    if world not in _NUMBERS:
+        surfaces = {name: i for i, name in enumerate(world.surfaces)}
+        supports = {name: i for i, name in enumerate(world.supports)}
+        _NUMBERS[world] = surfaces, supports
+    return _NUMBERS[world]
 
 
 def _constants(world: World) -> dict[str, Any]:

@@ -127,7 +127,9 @@ def frame_from_normal(normal: ArrayLike, heading: ArrayLike) -> np.ndarray:
     """
     # In plain floats: numpy takes several times as long for three numbers.
     zx, zy, zz = np.asarray(normal, dtype=float).tolist()
-    axis = np.eye(3)[int(np.argmin(np.abs((zx, zy, zz))))].tolist()
+    along_axes = [abs(zx), abs(zy), abs(zz)]
+    axis = [0.0, 0.0, 0.0]
+    axis[along_axes.index(min(along_axes))] = 1.0
     x = y = z = n = 0.0
     for hx, hy, hz in (np.asarray(heading, dtype=float).tolist(), axis):
         along = hx * zx + hy * zy + hz * zz

@@ -33,11 +33,12 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.tasks import (
+    Places,
     SurfaceTask,
     leaning,
     packed_pointing,
     packed_tasks,
-    pointing,
+    segment_ends,
 )
 
 # The core's constants, where a reader of results needs them.
@@ -232,6 +233,7 @@ class IK:
         self.core = _core.Workspace(self._model, rough, told)
         # The last problem, as the core has it.
         self._asked: tuple[PostureProblem, _core.Problem] | None = None
+        self._segments: dict[str, tuple[Places, Places]] = {}
 
     def build(
         self, problem: PostureProblem, q: np.ndarray, reach: float = ACTIVE_RANGE
@@ -304,6 +306,12 @@ class IK:
         """Recompute everything from the model at `q`."""
         return _residuals(self.core.residuals(self._ask(problem), q))
 
+    def _ends(self, segment: str) -> tuple[Places, Places]:
+        """Of a body segment; names are looked up once."""
+        if segment not in self._segments:
+            self._segments[segment] = segment_ends(self.world, segment)
+        return self._segments[segment]
+
     def _ask(self, p: PostureProblem) -> _core.Problem:
         """A problem as the core has it; the last one is kept."""
         if self._asked is not None and self._asked[0] is p:
@@ -312,7 +320,7 @@ class IK:
         points = []
         if p.direction_weight > 0:
             weight = p.direction_weight
-            points = [pointing(world, n, u, weight) for n, u in p.directions.items()]
+            points = [(*self._ends(n), u, weight) for n, u in p.directions.items()]
         if p.lean is not None:
             points.append(leaning(world, *p.lean))
         asked = _core.Problem(

@@ -192,6 +192,7 @@ def finish(
     world = ik.world
     kin = ik.kin
     kin.update(q)
+    places = new_positions(kin, task)
     new = tuple(
         Contact(
             surface=c.surface,
@@ -200,16 +201,14 @@ def finish(
             quaternion=_orientation(kin, c),
             link=quat_from_matrix(kin.rotation(world.surfaces[c.surface].body)),
         )
-        for c, p in zip(task.new, new_positions(kin, task), strict=True)
+        for c, p in zip(task.new, places, strict=True)
     )
     measured = KeyframeTask(
         held=(*task.held, *new), new=(), q_reference=q, directions=task.directions
     )
     residuals = ik.residuals(keyframe_problem(world, measured, options, ()), q)
     states = tuple(contact_state(kin, c) for c in measured.held)
-    cost_after, _ = stability_cost(
-        kin, task, new_positions(kin, task), options.stability_weight
-    )
+    cost_after, _ = stability_cost(kin, task, places, options.stability_weight)
     com = kin.com.copy()
     equilibrium = equilibrium_at(kin, q, measured.held)
     status = residuals.status

@@ -66,9 +66,9 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
     limit = theta_max(support.friction)
     phase = contact_phase(d, length, limit, loaded=loaded)
     # On a slope the line to the mass must lie within the cone about the normal too.
-    slope = contact_angle(c.position, mass, support.normal)
-    if support.normal[2] < 1.0 and slope > math.atan(support.friction):
-        phase = "sliding"
+    if support.normal[2] < 1.0:
+        slope = contact_angle(c.position, mass, support.normal)
+        phase = "sliding" if slope > math.atan(support.friction) else phase
     return ContactState(
         contact=c,
         projected_distance=d,

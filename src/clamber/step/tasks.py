@@ -7,6 +7,7 @@ link, and the link's material point with it.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from clamber import _core
 from clamber.contact.contact import Contact
+from clamber.model.core import numbers_of
 from clamber.model.records import short_repr
 from clamber.model.scene import Support
 from clamber.model.se3 import frame_from_normal, matrix_from_quat
@@ -127,7 +129,7 @@ def closed(world: World, c: Contact, *, loaded: bool = True) -> Closed | OnEdge:
 
 def sliding(world: World, c: Contact, reference: float, **more: Any) -> Sliding:
     """A contact that is closed on its support, and liked where it is."""
-    flat, R = replace(c, edge=None), _rotation(world, c)
+    flat, R = _flat(c), _rotation(world, c)
     return Sliding(contact=flat, rotation=R, reference=reference, **more)
 
 
@@ -142,8 +144,19 @@ def support_rotation(support: Support, quaternion: np.ndarray) -> np.ndarray:
     return frame_from_normal(support.normal, matrix_from_quat(quaternion)[:, 0])
 
 
+def _flat(c: Contact) -> Contact:
+    return c if c.edge is None else replace(c, edge=None)
+
+
 def _rotation(world: World, c: Contact) -> np.ndarray:
-    return support_rotation(world.supports[c.support], c.quaternion)
+    return _turned(world.supports[c.support], c)
+
+
+@functools.lru_cache(maxsize=64)  # a change asks for the same contacts a dozen times
+def _turned(support: Support, c: Contact) -> np.ndarray:
+    R = support_rotation(support, c.quaternion)
+    R.flags.writeable = False
+    return R
 
 
 # For the core: whole numbers, then real ones, a row for each.
@@ -155,15 +168,15 @@ def packed_tasks(
     world: World, tasks: Sequence[SurfaceTask]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 6) kinds, surfaces, supports, edges, flags, and (n, 19) numbers."""
-    surfaces, supports = list(world.surfaces), list(world.supports)
+    surfaces, supports = numbers_of(world)
     what = np.empty((len(tasks), 6), np.int32)
     where = np.empty((len(tasks), 19))
     for i, t in enumerate(tasks):
         c = t.contact
         what[i] = (
             _KINDS.index(type(t)),
-            surfaces.index(c.surface),
-            supports.index(c.support),
+            surfaces[c.surface],
+            supports[c.support],
             -1 if c.edge is None else c.edge,
             not isinstance(t, Reaching) and t.loaded,
             c.link is not None,
@@ -183,13 +196,13 @@ def packed_contacts(
     world: World, contacts: Sequence[Contact]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 4) surfaces, supports, edges, flags, and (n, 11) numbers."""
-    surfaces, supports = list(world.surfaces), list(world.supports)
+    surfaces, supports = numbers_of(world)
     what = np.empty((len(contacts), 4), np.int32)
     where = np.empty((len(contacts), 11))
     for i, c in enumerate(contacts):
         what[i] = (
-            surfaces.index(c.surface),
-            supports.index(c.support),
+            surfaces[c.surface],
+            supports[c.support],
             -1 if c.edge is None else c.edge,
             c.link is not None,
         )
@@ -209,18 +222,15 @@ def packed_parts(
     return [packed_contacts(world, c) for c in (held, broken, new)]
 
 
-# From the middle of one or two places (body, point (3,) in its frame) to that of
-# others, in a direction (3,) of the world, with a weight.
-Pointing = tuple[
-    Sequence[tuple[int, np.ndarray]],
-    Sequence[tuple[int, np.ndarray]],
-    np.ndarray,
-    float,
-]
+# One or two places: body, point (3,) in its frame.
+Places = Sequence[tuple[int, np.ndarray]]
+# From the middle of places to that of others, in a direction (3,) of the world, with a
+# weight.
+Pointing = tuple[Places, Places, np.ndarray, float]
 
 
-def pointing(world: World, segment: str, direction: np.ndarray, w: float) -> Pointing:
-    """A body segment by name, such as `left_thigh` or `trunk`, in a direction (3,)."""
+def segment_ends(world: World, segment: str) -> tuple[Places, Places]:
+    """Of a body segment by name, such as `left_thigh` or `trunk`."""
     limbs = world.robot.limbs
     if segment == "trunk":
         start = [limbs[x].root for x in ("left_leg", "right_leg")]
@@ -228,8 +238,7 @@ def pointing(world: World, segment: str, direction: np.ndarray, w: float) -> Poi
     else:
         limb, first, second = _SEGMENTS[segment]
         start, end = [getattr(limbs[limb], first)], [getattr(limbs[limb], second)]
-    starts, ends = map(world.landmark, start), map(world.landmark, end)
-    return list(starts), list(ends), direction, w
+    return [world.landmark(x) for x in start], [world.landmark(x) for x in end]
 
 
 def leaning(world: World, surface: str, direction: np.ndarray, w: float) -> Pointing:
