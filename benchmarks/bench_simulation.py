@@ -2,9 +2,10 @@
 
     python benchmarks/bench_simulation.py
 
-Simulates the built-in climb a few times by either controller, and steps the recorded commands in plain
-MuJoCo for comparison: the difference is what controller and measurements cost. Times
-are those of the processor, so that other programs do not count.
+Simulates the built-in climb a few times by either controller, and steps the recorded
+commands in plain MuJoCo for comparison: the difference is what controller and
+measurements cost. Times are those of the processor, so that other programs do not
+count.
 """
 
 from __future__ import annotations
