@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from clamber import _core
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Replanned, Stopped
 from clamber.execution.executive import Executive
@@ -100,6 +101,55 @@ def test_plain_mujoco_arrives_at_the_same_states_from_the_written_scene(
             assert np.array_equal(np.float32(data.qvel), demo_rollout.qvel[row])
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data)
+
+
+class Passive:
+    """Decides nothing."""
+
+    def decide(self, look: bool) -> None: ...
+
+    def balance(self) -> None: ...
+
+
+def test_the_deepest_contact_is_found_however_many_there_are():
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody>
+      <geom type="plane" size="2 2 0.1"/>
+      <body pos="0 0 0.2" euler="20 10 0">
+        <freejoint/> <geom type="box" size="0.1 0.1 0.1"/>
+      </body>
+    </worldbody></mujoco>""")
+    data, none, steps = mujoco.MjData(model), np.zeros((1, 0)), 1500
+    q, flags = data.qpos[None].copy(), np.zeros((1, 0), dtype=bool)
+    track = _core.Track(7, 0, 0)
+    track.load(q, none, none, flags, flags, steps)
+    share = {"pose_share": 1.0, "force_share": 1.0}
+    follower = _core.Follower(
+        _core.Filter(q[0].tolist(), 0, **share),
+        track,
+        _core.JointServo(kp=[], damping=[], ki=[], limit=[], dt=PHYSICS_STEP),
+        _core.SelfPositioning(arms=[], ankles=[], joints=0, rate=1.0),
+        **{"qadr": [], "period": 10, "touch": 1.0, "shift_share": 1.0},
+    )
+    follower.ends = True
+    sensors = _core.Sensors(nq=7, surfaces=0, late=0, force_stride=5, block=steps)
+    n = steps // 5
+    sensors.draw(*map(np.zeros, ((steps, 7), (steps, 3), (n, 0), (n, 0, 3))))
+    loop = _core.Loop(
+        data,
+        follower,
+        sensors,
+        _core.ContactForces([_core.SCENE, _core.OTHER], 0),
+        **{"order": [], "step_size": 1.0, "base": 1, "stride": 1, "tail": 0},
+        **{"tilt": np.pi, "height": 1.0, "push": None, "steps": 10},
+    )
+    depth, listed = [], []
+    while loop.step(Passive()):
+        mujoco.mj_step(model, data)
+        depth.append(max(0.0, *-data.contact.dist, 0.0))
+        listed.append(data.ncon)
+    assert {0, 1, 2, 4} <= set(listed)
+    assert np.array_equal(loop.recorded()["penetration"], depth)
 
 
 def test_it_starts_at_rest_where_the_plan_does(demo_plan, demo_rollout):

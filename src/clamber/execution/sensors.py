@@ -81,7 +81,9 @@ class Sensors:
         tilt = normal(0.0, ROTATION_NOISE, (BLOCK, 3))
         pull = normal(0.0, FORCE_NOISE, (n, self._surfaces, 3))
         gain = normal(0.0, FORCE_SCALE_NOISE, (n, self._surfaces))
-        self.core.draw(*(self._noise * x for x in (offset, tilt, gain, pull)))
+        for x in offset, tilt, gain, pull:
+            x *= self._noise
+        self.core.draw(offset, tilt, gain, pull)
 
     def read(self, data: mujoco.MjData) -> Measurement:
         """What is known at this physics step; call once for each."""
