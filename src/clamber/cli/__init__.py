@@ -56,8 +56,9 @@ def main(args: Sequence[str] | None = None) -> int:
         error = _by_flag(e) if isinstance(e, InputError) else e
         sys.stderr.write(f"clamber: {error}\n")
         return BAD_INPUT
-    except KeyboardInterrupt:
-        sys.stderr.write("clamber: interrupted; the files written so far are whole\n")
+    except KeyboardInterrupt as e:
+        said = str(e) or "interrupted; every file that was written is whole"
+        sys.stderr.write(f"clamber: {said}\n")
         return INTERRUPTED
     except BrokenPipeError:  # `clamber ... | head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -36,9 +36,9 @@ from clamber.cli.output import (
     REACHED,
     Clock,
     Output,
-    Report,
     closing,
     conclude,
+    filling,
     keyframe_tables,
     new_table,
     outcome,
@@ -47,7 +47,9 @@ from clamber.cli.output import (
     replanned_record,
     skipped_tables,
 )
+from clamber.cli.progress import Report, Track
 from clamber.cli.tools import (
+    DRAWING,
     ExportCommand,
     RenderCommand,
     ReportCommand,
@@ -85,22 +87,22 @@ class ClimbCommand:
         robot, scene = self.world.load()
         others = None if self.contacts == "demonstrated" else self.search.read()
         clock = Clock()
-        with self.output.progress() as show:
+        track = Track("detect", *PLANNING, *EXECUTION, *_drawing(self.video))
+        with self.output.progress(track, more=True) as show:
             report = clock.watching(show)
             report("detect", 0.0, "")
             demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
             sequence = clamber.detect_contacts(demo)
             report("detect", 1.0, "; ".join(demo.notes[:1]))
             folder = clamber.new_run_folder(self.out, "climb")
-            clamber.save_sequence(sequence, folder / "sequence.json")
-            with self.world.blamed():
+            with filling(folder), self.world.blamed():
+                clamber.save_sequence(sequence, folder / "sequence.json")
                 plan = _plan(
                     sequence, robot, scene, self.planning, folder, report, others
                 )
-            done = self.execution.simulate(plan, folder, report, None)
-        return _finish(
-            self.output, folder, plan, done, clock, self.video, (demo, sequence)
-        )
+                done = self.execution.simulate(plan, folder, report, None)
+        shown = (demo, sequence)
+        return _finish(self.output, folder, plan, done, clock, track, self.video, shown)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +122,7 @@ class ContactsCommand:
     def run(self) -> int:
         """Recording to contact sequence."""
         scene = None if self.scene is None else clamber.load_scene(self.scene)
-        with self.output.progress() as report:
+        with self.output.progress(Track("detect")) as report:
             report("detect", 0.0, "")
             demo = clamber.load_demo(
                 self.recording, scene=scene, fit_floor=self.fit_floor
@@ -171,11 +173,11 @@ class PlanCommand:
         sequence = clamber.load_sequence(self.sequence)
         robot, scene = self.world.load()
         clock = Clock()
-        with self.output.progress() as show:
+        with self.output.progress(Track(*PLANNING)) as show:
             folder = clamber.new_run_folder(self.out, "plan")
-            clamber.save_sequence(sequence, folder / "sequence.json")
             report = clock.watching(show)
-            with self.world.blamed():
+            with filling(folder), self.world.blamed():
+                clamber.save_sequence(sequence, folder / "sequence.json")
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
         record = {"out": str(folder), **plan_record(plan, clock)}
         note = closing(outcome(plan), folder, plan.complete)
@@ -222,7 +224,8 @@ class ReplanCommand:
         sequence = clamber.load_sequence(self.source)
         robot, scene = self.world.load()
         others = self.search.read()
-        with self.output.progress() as report, self.world.blamed():
+        stages = Track("plan", "save")
+        with self.output.progress(stages) as report, self.world.blamed():
             found = clamber.replan(
                 sequence,
                 robot,
@@ -232,9 +235,11 @@ class ReplanCommand:
                 progress=report,
             )
             folder = clamber.new_run_folder(self.out, "replan")
-            clamber.save_sequence(sequence, folder / "sequence.json")
-            clamber.save_plan(found.best.plan, folder)
-            save_replanned(found, folder)
+            report("save", 0.0, "")
+            with filling(folder):
+                clamber.save_sequence(sequence, folder / "sequence.json")
+                clamber.save_plan(found.best.plan, folder)
+                save_replanned(found, folder)
         if self.output.json:  # these two fields and no other
             sys.stdout.write(json.dumps(replanned_record(found)) + "\n")
             return REACHED if found.best.stable else MISSED
@@ -262,8 +267,9 @@ class ReplanCommand:
             scene = scene_of(self.world.height, self.world.scene)
         others = self.search.read()
         q, touching = load_state(made, self.source, begin)
-        with self.output.progress() as report, self.world.blamed():
-            report("replan", 0.0, "")
+        stages = Track(*PLANNING)
+        with self.output.progress(stages) as report, self.world.blamed():
+            report("plan", 0.0, "")
             now = clamber.state_of(made, scene, q, touching, source=begin)
             plan = clamber.plan(
                 made.policy or made.sequence,
@@ -275,8 +281,10 @@ class ReplanCommand:
                 progress=report,
             )
             folder = clamber.new_run_folder(self.out, "replan")
-            clamber.save_sequence(plan.sequence, folder / "sequence.json")
-            clamber.save_plan(plan, folder)
+            report("save", 0.0, "")
+            with filling(folder):
+                clamber.save_sequence(plan.sequence, folder / "sequence.json")
+                clamber.save_plan(plan, folder)
         record = {"out": str(folder), "done": now.done, **plan_record(plan)}
         on = ", ".join(f"{c.surface} on {c.support}" for c in now.stance)
         note = f"from {on}, {now.done} steps made: {outcome(plan)}"
@@ -324,18 +332,22 @@ class TraverseCommand:
         )
         clock = Clock()
         world = WorldFlags(robot=self.robot, scene=self.scene)
-        with self.output.progress() as show:
+        track = Track(*PLANNING, *EXECUTION, *_drawing(self.video))
+        with self.output.progress(track, more=True) as show:
             report = clock.watching(show)
             with world.blamed():
                 plan = clamber.plan(
                     policy, robot, scene, options=options, progress=report
                 )
             folder = clamber.new_run_folder(self.out, "traverse")
-            clamber.save_plan(plan, folder)
-            done = None
-            if plan.complete:
-                done = self.execution.simulate(plan, folder, report, None)
-        return _finish(self.output, folder, plan, done, clock, self.video)
+            with filling(folder):
+                report("save", 0.0, "")
+                clamber.save_plan(plan, folder)
+                report("save", 1.0, "")
+                done = None
+                if plan.complete:
+                    done = self.execution.simulate(plan, folder, report, None)
+        return _finish(self.output, folder, plan, done, clock, track, self.video)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,7 +365,8 @@ class SimulateCommand:
         """Plan to verdict."""
         plan = clamber.load_plan(self.run_folder)
         clock = Clock()
-        with self.output.progress() as show:
+        stages = Track(*EXECUTION)
+        with self.output.progress(stages) as show, filling(self.run_folder):
             done = self.execution.simulate(
                 plan, self.run_folder, clock.watching(show), self.scene
             )
@@ -386,7 +399,7 @@ class LearnCommand:
             raise InputError(
                 "a file that ends in .json", source="--out", value=str(self.out)
             )
-        with self.output.progress() as report:
+        with self.output.progress(Track("detect", "draw")) as report:
             sequences = []
             for k, name in enumerate(self.demonstrations):
                 report("detect", k / len(self.demonstrations), name)
@@ -441,6 +454,13 @@ Command = (
 )
 
 
+PLANNING, EXECUTION = ("plan", "trajectory", "save"), ("simulate", "save run")
+
+
+def _drawing(video: bool) -> tuple[str, ...]:
+    return DRAWING if video else DRAWING[:1]
+
+
 def _plan(
     sequence: clamber.ContactSequence,
     robot: clamber.Robot,
@@ -473,13 +493,14 @@ def _finish(
     plan: clamber.Plan,
     done: tuple[clamber.Rollout, clamber.Verdict] | None,
     clock: Clock,
+    track: Track,
     video: bool,
     demonstration: tuple[clamber.Demonstration, clamber.ContactSequence] | None = None,
 ) -> int:
     """The verdict, and then pictures, which nobody need wait for; the exit code."""
     code = conclude(output, folder, plan, done, clock)
     missing = []
-    with output.progress() as show:
+    with output.progress(track) as show, filling(folder):
         report = clock.watching(show)
         try:
             clamber.render_run(

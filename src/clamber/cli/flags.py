@@ -163,9 +163,12 @@ class ExecutionFlags:
             true_scene=None if truth is None else clamber.load_scene(truth),
             progress=report,
         )
+        report("save run", 0.0, "")
         clamber.save_rollout(plan, rollout, folder)
+        report("save run", 0.8, "verdict")
         verdict = clamber.judge(plan, rollout)
         clamber.save_verdict(verdict, folder)
+        report("save run", 1.0, "")
         return rollout, verdict
 
 

@@ -11,29 +11,21 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 import clamber
+from clamber.cli.progress import Report, Track, bar, lines
 from clamber.execution.events import event_fields
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: the robot made it (or the command did its work), it did not, bad
 input, interrupted, nobody reads the output any more (as in `clamber ... | head`)."""
-
-Report = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,16 +38,20 @@ class Output:
     """No progress, no table: files and exit code only."""
 
     @contextlib.contextmanager
-    def progress(self) -> Iterator[Report]:
-        """Yield `report(stage, share done, note)`; it draws on stderr."""
+    def progress(self, track: Track, *, more: bool = False) -> Iterator[Report]:
+        """Yield `report(stage, share done, note)`; it draws on stderr.
+
+        Args:
+            track: The stages of the command.
+            more: The command goes on after it.
+        """
         console = Console(stderr=True)
         if self.quiet:
             yield lambda stage, done, note: None
-        elif console.is_terminal:
-            with progress_bars(console) as report:
-                yield report
         else:
-            yield progress_lines(console)
+            draw = bar if console.is_terminal else lines
+            with draw(console, track, more=more) as report:
+                yield report
 
     def warn(self, *texts: str) -> None:
         """Say what could not be done, a sentence a line, on stderr."""
@@ -82,43 +78,30 @@ class Output:
         sys.stdout.flush()
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while a run folder was being filled."""
+
+    def __init__(self, folder: Path) -> None:
+        """`folder`: Of the run; every file that is in it is whole."""
+        super().__init__(str(folder))
+        self.folder = folder
+
+    def __str__(self) -> str:
+        """What there is."""
+        files = self.folder.glob("*") if self.folder.is_dir() else ()
+        names = sorted(f.name for f in files if not f.name.startswith("."))
+        if not names:
+            return f"interrupted; nothing was written to {self.folder}"
+        return f"interrupted; in {self.folder} are, whole: {', '.join(names)}"
+
+
 @contextlib.contextmanager
-def progress_bars(console: Console) -> Iterator[Report]:
-    """One bar for each stage, with its share and the time left."""
-    columns = (
-        TextColumn("{task.description:<10}"),
-        BarColumn(bar_width=24),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-    )
-    with Progress(*columns, console=console) as bars:
-        tasks = {}
-
-        def report(stage: str, done: float, note: str) -> None:
-            if stage not in tasks:
-                for earlier in tasks.values():
-                    bars.update(earlier, completed=1.0, note="")
-                tasks[stage] = bars.add_task(stage, total=1.0, note=note)
-            bars.update(tasks[stage], completed=done, note=note)
-
-        yield report
-        for task in tasks.values():
-            bars.update(task, completed=1.0, note="")
-
-
-def progress_lines(console: Console) -> Report:
-    """One line for each tenth of a stage, for logs."""
-    shown: dict[str, int] = {}
-
-    def report(stage: str, done: float, note: str) -> None:
-        tenth = int(10 * done)
-        if shown.get(stage, -1) < tenth:
-            shown[stage] = tenth
-            line = f"{stage} {100 * done:3.0f} % {note}".rstrip()
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-    return report
+def filling(folder: Path) -> Iterator[None]:
+    """Have an interrupt say what the run folder holds by then."""
+    try:
+        yield
+    except KeyboardInterrupt as e:
+        raise Interrupted(folder) from e
 
 
 class Clock:

@@ -25,10 +25,13 @@ from clamber.cli.output import (
     INTERRUPTED,
     MISSED,
     REACHED,
-    Report,
+    filling,
     new_table,
 )
+from clamber.cli.progress import Report, Track
 from clamber.errors import ClamberError, InputError
+
+DRAWING = ("pictures", "video")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +67,11 @@ class RenderCommand:
     def run(self) -> int:
         """Run to pictures."""
         self._check()
-        with self.output.progress() as report:
+        alone = self.sheet or self.frame is not None
+        track = Track(
+            *(["pictures"] if alone else ["video"] if self.video else DRAWING)
+        )
+        with self.output.progress(track) as report, filling(self.run_folder):
             files = self._draw(report)
         names = [str(f) for f in files]
         self.output.show({"files": names}, note="\n".join(names))
@@ -96,6 +103,7 @@ class RenderCommand:
                 given |= {"out": self.out, "transparent": self.transparent}
                 given |= {} if size is None else {"size": size}
                 given |= {} if self.marks is None else {"marks": self.marks}
+                report("pictures", 0.0, "")
                 return [pictures.render_frame(self.run_folder, self.frame, **given)]
             plan = clamber.load_plan(self.run_folder)
             if self.sheet:
@@ -103,6 +111,7 @@ class RenderCommand:
                 if path.suffix != ".png":
                     raise InputError("a name that ends in .png", source=path)
                 given |= {} if size is None else {"tile": size}
+                given["report"] = report
                 return [pictures.keyframe_sheet(plan, path, **given)]
             rollout = clamber.load_rollout(self.run_folder)
             given |= {"out": self.out, "size": size, "report": report}
@@ -146,7 +155,7 @@ class ReportCommand:
 
     def run(self) -> int:
         """Run to one page."""
-        with self.output.progress() as report:
+        with self.output.progress(Track("report")) as report:
             report("report", 0.0, "")
             files = {"compare": self.compare, "out": self.out}
             done = clamber.write_report(self.run_folder, **files)
@@ -388,7 +397,7 @@ class SweepCommand:
         folder = self.out or Path("runs") / self.spec.stem
         sweep.check_inputs(spec)
         try:
-            with self.output.progress() as report:
+            with self.output.progress(Track("sweep", "draw")) as report:
                 rows, pace = sweep.run_sweep(
                     spec,
                     folder,

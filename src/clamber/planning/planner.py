@@ -270,7 +270,7 @@ class _Task:
 
     def timed(self, found: Plan) -> Plan:
         """A plan with its trajectory."""
-        self._search.report("trajectory", 1.0, "")
+        self._search.report("trajectory", 0.0, "")
         self._clock.lap("search")
         speed = self._options.speed
         trajectory = timed(found.world, found.changes, speed, self._lead)

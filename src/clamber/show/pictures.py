@@ -64,6 +64,8 @@ from clamber.show.sample import row_at, sample_motion
 from clamber.show.skeleton import skeleton_of
 from clamber.step.posture import Keyframe
 
+CLIMB_FRAMES = 12
+PLOTS = 14.0  # of a run take as long as so many pictures of a sheet
 SAMPLES = 400  # of a plot over time
 FRAME_SIZE = (1920, 1080)
 CLOSE = 0.12  # [height of the motion] around it boxes are in a sheet's pictures
@@ -159,6 +161,7 @@ def keyframe_sheet(
     *,
     tile: tuple[int, int] = TILE,
     camera: Preset = "corner",
+    report: Report | None = None,
 ) -> Path:
     """Draw each keyframe with its contacts, forces and margins.
 
@@ -174,6 +177,8 @@ def keyframe_sheet(
     tiles, steps = [], [None, *(c.step for c in plan.changes)]
     with Camera(world, tile) as drawing:
         for i, key in enumerate(plan.keyframes):
+            if report is not None:
+                report("pictures", i / len(plan.keyframes), "keyframes")
             picture = drawing.shot(key.q, view)
             mark_keyframe(picture, view, world, key)
             tiles.append((picture, keyframe_caption(i, key, steps[i])))
@@ -217,8 +222,9 @@ def climb_sheet(
     rollout: Rollout,
     path: str | Path,
     *,
-    frames: int = 12,
+    frames: int = CLIMB_FRAMES,
     tile: tuple[int, int] = (300, 250),
+    report: Report | None = None,
 ) -> Path:
     """Draw what physics did, in pictures evenly spaced in time."""
     rows = np.linspace(0, len(rollout.time) - 1, frames).round().astype(int)
@@ -226,7 +232,9 @@ def climb_sheet(
     view = view_of(rollout.world, seen, tile[0] / tile[1])
     tiles = []
     with Camera(rollout.world, tile) as camera:
-        for row in rows:
+        for i, row in enumerate(rows):
+            if report is not None:
+                report("pictures", i / len(rows), "climb")
             picture = camera.shot(rollout.qpos[row], view)
             tiles.append((picture, [f"{rollout.time[row]:.1f} s"]))
     return _save_sheet(tiles, path, columns=4, colours=200)
@@ -289,22 +297,36 @@ def render_run(
     tell = report or (lambda stage, share, note: None)
     plan, rollout, broken = _readable(folder)
     files: list[Path] = []
+    # What there is to draw is known beforehand, in pictures of a sheet.
+    drawn, plots = 0.0, PLOTS if rollout is not None else 0.0
+    sheets = [float(len(plan.keyframes)), CLIMB_FRAMES if rollout is not None else 0]
+    whole = plots + sum(sheets)
+
+    def within(count: float) -> Report:
+        return lambda stage, share, note: tell(
+            stage, (drawn + share * count) / whole, note
+        )
+
     tell("pictures", 0.0, "plots")
     if demonstration is not None:
         files.append(demonstration_plot(*demonstration, folder / "demonstration.png"))
     if rollout is not None:
         motion = sample_motion(plan, rollout, {}, SAMPLES)
+        tell("pictures", plots / 2 / whole, "plots")
         asked = plan.options.keyframe.balance_margin
         files.append(contact_plot(motion, folder / "contacts.png"))
         files.append(stability_plot(motion, asked, folder / "stability.png"))
     if plan.iterations:
         files.append(cost_to_go_plot(plan, folder / "cost-to-go.png"))
-    tell("pictures", 0.4, "keyframes")
-    files.append(keyframe_sheet(plan, folder / "keyframes.png"))
+    drawn = plots
+    report_sheet = within(sheets[0])
+    files.append(keyframe_sheet(plan, folder / "keyframes.png", report=report_sheet))
+    drawn += sheets[0]
     if rollout is not None:
-        tell("pictures", 0.7, "climb")
-        files.append(climb_sheet(rollout, folder / "climb.png"))
-        tell("pictures", 1.0, "")
+        report_sheet = within(sheets[1])
+        files.append(climb_sheet(rollout, folder / "climb.png", report=report_sheet))
+    tell("pictures", 1.0, "")
+    if rollout is not None:
         if with_video:
             skeleton = None
             if demonstration is not None:
