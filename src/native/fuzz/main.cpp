@@ -84,9 +84,9 @@ int main(int argc, char** argv) {
     const std::string only = argc > 3 ? argv[3] : "";
     const long long first = argc > 4 ? std::atoll(argv[4]) : 0;
     signal(SIGABRT, [](int) { tell_where(); });  // how both sanitizers end (make fuzz)
-    signal(SIGALRM, on_tick);
+    signal(SIGPROF, on_tick);
     const itimerval every{{10, 0}, {10, 0}};
-    setitimer(ITIMER_REAL, &every, nullptr);
+    setitimer(ITIMER_PROF, &every, nullptr);
     for (const Part& part : PARTS)
         if (only.empty() || only == part.name) run(part, count, seed, first);
     return broken_promises > 0;
