@@ -512,6 +512,18 @@ def test_a_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (tmp_path / "runs" / "notebook" / "climb.png").is_file()
 
 
+BUILT_IN = re.compile(r"built-in,? (?:\w+ )?(demonstration|climb|crossing)", re.I)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_nothing_synthetic_is_called_a_recording_of_a_person(page: Path):
+    text = " ".join(page.read_text().split())
+    assert not re.search(r"built-in(,? \w+)? (recording|take)", text)
+    assert not re.search(r"(crossing|climb)`,? is of a person", text)
+    if BUILT_IN.search(text) or 'load_demo("c' in text:
+        assert "synthetic" in text.lower()
+
+
 def test_the_moving_picture_moves_and_is_small():
     path = ROOT / "docs" / "front.webp"
     assert path.stat().st_size < 1_000_000
