@@ -169,7 +169,7 @@ def stability() -> Figure:
 
 
 def transition(plan) -> Figure:
-    """From above: the polygon of the contacts that stay, its ellipse, the CoM's path."""
+    """From above: polygon of the contacts that stay, its ellipse, the CoM's path."""
     fig = Figure(figsize=(7, 3.0), layout="constrained")
     chosen = (plan.changes[0], plan.changes[-2])
     for ax, change in zip(fig.subplots(1, 2), chosen, strict=True):
