@@ -90,12 +90,11 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	$(BIN)/python docs/tools/pictures.py docs/stages
 
 front: $(VENV)/.has-video ## the moving picture of the first page anew (fetches a G1, 145 MB; minutes)
-	rm -rf $(FRONT)/climb $(FRONT)/crossing $(FRONT)/g1 $(FRONT)/robot
+	rm -rf $(FRONT)/climb $(FRONT)/crossing $(FRONT)/robot
 	test -d $(FRONT)/wheels || $(BIN)/python $(PIP) --no-deps --target $(FRONT)/wheels mjlab example-robot-data
 	$(BIN)/clamber robot init $(FRONT)/wheels/mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml --out $(FRONT)/robot \
 		--effort $(FRONT)/wheels/cmeel.prefix/share/example-robot-data/robots/g1_description/urdf/g1_29dof_rev_1_0.urdf
-	$(BIN)/clamber climb --robot $(FRONT)/robot/robot.yaml --height 0.32 --out $(FRONT)/g1
-	$(BIN)/clamber climb --out $(FRONT)/climb
+	$(BIN)/clamber climb --robot $(FRONT)/robot/robot.yaml --height 0.32 --out $(FRONT)/climb
 	$(BIN)/clamber learn crossing --out $(FRONT)/policy.json
 	$(BIN)/clamber traverse $(FRONT)/policy.json --scene docs/tools/crossing.yaml --out $(FRONT)/crossing
 	$(BIN)/python docs/tools/front.py $(FRONT) docs/front.webp
