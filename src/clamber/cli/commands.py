@@ -8,9 +8,11 @@ functions in order, as `clamber.<name>`: those are imported on first use, so tha
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +20,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 import clamber
+from clamber.cli.aside import drawing_aside
 from clamber.cli.flags import (
     ExecutionFlags,
     Flat,
@@ -88,21 +91,28 @@ class ClimbCommand:
         others = None if self.contacts == "demonstrated" else self.search.read()
         clock = Clock()
         track = Track("detect", *PLANNING, *EXECUTION, *_drawing(self.video))
-        with self.output.progress(track, more=True) as show:
-            report = clock.watching(show)
-            report("detect", 0.0, "")
-            demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
-            sequence = clamber.detect_contacts(demo)
-            report("detect", 1.0, "; ".join(demo.notes[:1]))
-            folder = clamber.new_run_folder(self.out, "climb")
-            with filling(folder), self.world.blamed():
-                clamber.save_sequence(sequence, folder / "sequence.json")
-                plan = _plan(
-                    sequence, robot, scene, self.planning, folder, report, others
-                )
-                done = self.execution.simulate(plan, folder, report, None)
-        shown = (demo, sequence)
-        return _finish(self.output, folder, plan, done, clock, track, self.video, shown)
+        with drawing_aside() as draw:
+            with self.output.progress(track, more=True) as show:
+                report = clock.watching(show)
+                report("detect", 0.0, "")
+                demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
+                sequence = clamber.detect_contacts(demo)
+                report("detect", 1.0, "; ".join(demo.notes[:1]))
+                folder = clamber.new_run_folder(self.out, "climb")
+                with filling(folder), self.world.blamed():
+                    clamber.save_sequence(sequence, folder / "sequence.json")
+                    plan = _plan(
+                        sequence, robot, scene, self.planning, folder, report, others
+                    )
+                    shown = {"demonstration": (demo, sequence)}
+                    drawn = [draw(folder, parts=("plan",), **shown)]
+                    done = self.execution.simulate(plan, folder, report, None)
+            code = conclude(self.output, folder, plan, done, clock)
+            if done is not None:
+                drawn.append(draw(folder, parts=("climb",)))
+            shown |= {"parts": ("plots",), "with_video": self.video}
+            _draw(self.output, folder, clock, track, drawn, **shown)
+        return code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,7 +357,9 @@ class TraverseCommand:
                 done = None
                 if plan.complete:
                     done = self.execution.simulate(plan, folder, report, None)
-        return _finish(self.output, folder, plan, done, clock, track, self.video)
+        code = conclude(self.output, folder, plan, done, clock)
+        _draw(self.output, folder, clock, track, with_video=self.video)
+        return code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -487,30 +499,26 @@ def _plan(
     return result
 
 
-def _finish(
+def _draw(
     output: Output,
     folder: Path,
-    plan: clamber.Plan,
-    done: tuple[clamber.Rollout, clamber.Verdict] | None,
     clock: Clock,
     track: Track,
-    video: bool,
-    demonstration: tuple[clamber.Demonstration, clamber.ContactSequence] | None = None,
-) -> int:
-    """The verdict, and then pictures, which nobody need wait for; the exit code."""
-    code = conclude(output, folder, plan, done, clock)
-    missing = []
+    aside: Sequence[Future[None]] = (),
+    **options: Any,
+) -> None:
+    """Pictures, which nobody need wait for, and those that are drawn `aside`."""
+    missing: dict[str, None] = {}  # each reason once
     with output.progress(track) as show, filling(folder):
         report = clock.watching(show)
-        try:
-            clamber.render_run(
-                folder, with_video=video, demonstration=demonstration, report=report
-            )
-        except ClamberError as e:  # the robot has made it all the same
-            missing.append(str(e))
+        here = functools.partial(clamber.render_run, folder, report=report, **options)
+        for drawn in (here, *(x.result for x in aside)):
+            try:
+                drawn()
+            except (ClamberError, BrokenExecutor) as e:  # it has made it all the same
+                missing[str(e)] = None
         _save_timings(folder, clock)
     output.warn(*missing)
-    return code
 
 
 def _save_timings(folder: Path, clock: Clock) -> None:

@@ -14,6 +14,7 @@ import hashlib
 import importlib.metadata
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -218,11 +219,19 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
         (folder / name).unlink(missing_ok=True)
     for name in (PLANNED_SCENE, SCENE):
         _save_world(plan.world, folder / name)
-    if plan.trajectory is not None:
-        save_trajectory(plan.trajectory, folder / PLANNED_TRAJECTORY)
-        save_trajectory(in_steps(plan.trajectory), folder / TRAJECTORY)
-    save_timings(folder, plan.timings)
-    write_json(folder / PLAN, _plan_fields(plan, folder))
+    with ThreadPoolExecutor(1) as pool:  # packing takes no interpreter
+        packed = pool.submit(_save_motion, plan.trajectory, folder)
+        save_timings(folder, plan.timings)
+        written = _plan_fields(plan, folder)
+        packed.result()
+    write_json(folder / PLAN, written)
+
+
+def _save_motion(trajectory: Trajectory | None, folder: Path) -> None:
+    """What is planned, and what is to run."""
+    if trajectory is not None:
+        save_trajectory(trajectory, folder / PLANNED_TRAJECTORY)
+        save_trajectory(in_steps(trajectory), folder / TRAJECTORY)
 
 
 def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
@@ -518,8 +527,10 @@ def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
     folder = Path(folder)
     _save_world(rollout.world, folder / SCENE)
     followed = rollout.followed or in_steps(trajectory_of(plan, folder))
-    save_trajectory(followed, folder / TRAJECTORY)
-    write_npz(folder / ROLLOUT, CODEC.arrays(rollout, without=_NOT_IN_ROLLOUT))
+    with ThreadPoolExecutor(1) as pool:
+        packed = pool.submit(save_trajectory, followed, folder / TRAJECTORY)
+        write_npz(folder / ROLLOUT, CODEC.arrays(rollout, without=_NOT_IN_ROLLOUT))
+        packed.result()
     write_json(
         folder / EXECUTION,
         {
