@@ -389,6 +389,24 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
     assert capsys.readouterr().err.count("clamber: no OpenGL") == 1
 
 
+def test_the_seconds_of_a_search_are_those_of_all_of_it(
+    quick_climb: SimpleNamespace, tmp_path: Path, monkeypatch: Patch
+):
+    seconds = {"search": 100.0, "trajectory": 1.0}
+
+    def plan(*_: object, progress: Callable[..., None], **__: object) -> clamber.Plan:
+        progress("plan", 0.5, "as demonstrated")
+        progress("search", 0.5, "the last part of it")
+        progress("trajectory", 1.0, "")
+        return replace(quick_climb.plan, timings=seconds)
+
+    monkeypatch.setitem(vars(clamber), "plan", plan)
+    cli.main(["climb", "--height", "0.25", "--out", str(tmp_path / "a")])
+    written = json.loads((tmp_path / "a" / "timings.json").read_text())["seconds"]
+    assert {k: written[k] for k in seconds} == seconds
+    assert "plan" not in written
+
+
 @pytest.mark.pool
 def test_a_plan_is_drawn_in_another_process_as_in_this_one(
     folder: Path, tmp_path: Path

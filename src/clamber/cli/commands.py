@@ -525,6 +525,6 @@ def _save_timings(folder: Path, clock: Clock) -> None:
     """Add the seconds of the stages that were watched."""
     from clamber.run.folder import save_timings
 
-    finer = ("plan", "trajectory")  # of which the plan itself knows the parts
+    finer = ("plan", "search", "trajectory")  # of which the plan itself knows all
     stages = clock.stages().items()
     save_timings(folder, {k: v for k, v in stages if k not in finer})

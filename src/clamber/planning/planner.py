@@ -154,11 +154,11 @@ def plan(
             robot's reach; the robot cannot stand there.
     """
     options, robot, scene = _checked(options), load_robot(robot), load_scene(scene)
-    report, budget = progress or silent, budget or Budget()
+    report, budget, clock = progress or silent, budget or Budget(), _Clock()
 
     def task(scene: Scene, clearance: ExtraClearance) -> _Task:
         ik = IK(build_world(robot, scene), clearance)
-        return _Task(goal, Search(ik, options, budget, report), start, counts)
+        return _Task(goal, Search(ik, options, budget, report), start, counts, clock)
 
     here = task(scene, clearance)
     found = here.asked_for()
@@ -199,9 +199,9 @@ def replan(
     Raises:
         InputError: The scene does not fit the sequence, or is out of the robot's reach.
     """
-    ik = IK(build_world(robot, scene))
+    clock, ik = _Clock(), IK(build_world(robot, scene))
     search = Search(ik, _checked(options), budget, progress or silent)
-    task = _Task(sequence, search, None, counts)
+    task = _Task(sequence, search, None, counts, clock)
     ranked = [replace(r, plan=task.timed(r.plan)) for r in task.ranked(None)]
     return Replanned(
         differences=contact_differences(sequence),
@@ -239,6 +239,7 @@ class _Task:
         search: Search,
         start: Start | None,
         counts: Counts | None,
+        clock: _Clock,
     ) -> None:
         """Stand up, or settle in the stance as it is."""
         self._goal, self._search, self._counts = goal, search, counts
@@ -247,7 +248,7 @@ class _Task:
         self._from_standing = start is None
         self._lead: tuple[Phase, ...] = ()
         self._unsettled: tuple[Failure, ...] = ()
-        self._clock = _Clock()
+        self._clock = clock
         if isinstance(start, State):
             self._start, self._lead = settle(self._ik, start, self._options)
             status = self._start.status
