@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from multiprocessing.reduction import ForkingPickler
+from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import clamber
@@ -18,29 +15,29 @@ import clamber
 Drawing = Callable[..., Future[None]]
 
 
-def _read_only(content: dict) -> MappingProxyType:
-    return MappingProxyType(content)
-
-
-# Records hold mappings that nobody can write to.
-ForkingPickler.register(MappingProxyType, lambda m: (_read_only, (dict(m),)))
-
-
 @contextlib.contextmanager
 def drawing_aside() -> Iterator[Drawing]:
     """What draws aside; the process begins to import at once, and is waited for."""
-    spawn = multiprocessing.get_context("spawn")  # there may be threads in this one
-    with ProcessPoolExecutor(1, mp_context=spawn) as pool:
-        pool.submit(_prepare)  # a pool starts its processes with the first task
+    # As sweeps do; it does not run the caller's script a second time, as spawn does.
+    from joblib.externals.loky import ProcessPoolExecutor
+
+    pool = ProcessPoolExecutor(1)
+    try:
+        pool.submit(_prepare)
 
         def draw(folder: Path, **options: Any) -> Future[None]:
-            return pool.submit(_draw, folder, options)
+            try:
+                return pool.submit(_draw, folder, options)
+            except BrokenExecutor as e:  # it is told of where the picture is waited for
+                broken: Future[None] = Future()
+                broken.set_exception(e)
+                return broken
 
-        try:
-            yield draw
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        yield draw
+        pool.shutdown(wait=True)
+    except BaseException:
+        pool.shutdown(wait=True, kill_workers=True)
+        raise
 
 
 def _prepare() -> None:
