@@ -63,6 +63,7 @@ class Step:
         breaks: Surfaces that leave their contacts.
         makes: The contact that is made, its position a reference until optimised.
         fixed: The position is taken as it is, or as near as can be reached.
+        turns: Where nothing else helps, a flat surface may lie turned on its support.
         target: The stance of the demonstration that it leads to.
         stance: Its index in the sequence.
         seeds: Where its postures may be found.
@@ -78,6 +79,7 @@ class Step:
     breaks: tuple[str, ...]
     makes: Contact | None
     fixed: bool = False
+    turns: bool = False
     target: Stance = NOT_SHOWN
     stance: int = 0
     seeds: Seeds = Seeds()

@@ -306,7 +306,8 @@ class Gait:
     def _dismount(self, at: Outcome, platform: Platform) -> Part:
         """The ascent from behind the far edge reversed, as far as it is left.
 
-        Where that cannot be, contacts move to where it begins: from there is a way.
+        Where that cannot be, contacts move to where it begins: from there is a way, at
+        worst with feet that lie turned.
         """
         edge = platform.exit
         assert edge is not None
@@ -334,6 +335,8 @@ class Gait:
                 contact = contact_at(c.surface, *to, body.yaw)
                 goals.append(self._goal(at, self.cycle, contact))
         yield Proposal(after=at, goals=goals, body=body, rounds=IMPOSED, accept="some")
+        turning = [(replace(step, turns=True), option) for step, option in steps]
+        yield Climb(after=at, steps=turning)
 
     # On all fours.
 

@@ -22,6 +22,7 @@ from clamber.step.posture import (
     KeyframeOptions,
     KeyframeTask,
     finish,
+    orientation_at,
 )
 from clamber.step.stability import limiting_joint
 from clamber.step.tasks import support_rotation
@@ -170,7 +171,8 @@ def change_contact(
     where a contact is made, with their feet on tiptoe, which reach farther; each with
     the new contact where the optimisation puts it and where the unloaded robot reaches
     it (the other way round where its place is prescribed); each with every one of
-    `MARGINS`.
+    `MARGINS`. Where nothing works and the step `turns`, a flat surface lies as it comes
+    to where the unloaded robot reaches.
 
     Args:
         ik: Workspace.
@@ -190,6 +192,12 @@ def change_contact(
             if isinstance(found, Change):
                 return found
         failure = failure or found
+    if step.turns and step.makes is not None:
+        for held in _footings(ik, before, step):
+            key = _keyframe_turned(ik, before, step, held, options)
+            found = _change(ik, before, replace(key, method=method), step)
+            if isinstance(found, Change):
+                return found
     if failure is None:
         why = "nothing else bears load"
         return Failure(status=Status.UNBALANCED, step=step, detail=why)
@@ -218,18 +226,8 @@ def _keyframes(
 ) -> Iterator[Keyframe]:
     """Postures in which the contact is changed, on the contacts `held`."""
     wanted = step.makes
-    new = () if wanted is None else (wanted,)
-    task = KeyframeTask(
-        held=held,
-        new=new,
-        q_reference=before.q if step.reference is None else step.reference,
-        directions=step.target.posture,
-        base_rotation=step.base_rotation,
-    )
-    begin = before.q
-    if step.stands_up:
-        begin = _home_over(ik.world, (*held, *new))
-        task = replace(task, q_reference=begin, directions={})
+    task = _task(ik.world, before, step, held)
+    begin = task.q_reference if step.stands_up else before.q
     for there in (True, False) if step.fixed else (False, True):
         if there and wanted is not None:
             # Put the contact where the unloaded robot reaches it.
@@ -266,6 +264,41 @@ def _change(ik: IK, before: Keyframe, key: Keyframe, step: Step) -> Change | Fai
                 margin=margin,
             )
     return Failure(status=status, step=step, detail=detail)
+
+
+def _task(
+    world: World, before: Keyframe, step: Step, held: tuple[Contact, ...]
+) -> KeyframeTask:
+    new = () if step.makes is None else (step.makes,)
+    task = KeyframeTask(
+        held=held,
+        new=new,
+        q_reference=before.q if step.reference is None else step.reference,
+        directions=step.target.posture,
+        base_rotation=step.base_rotation,
+    )
+    if step.stands_up:
+        home = _home_over(world, (*held, *new))
+        task = replace(task, q_reference=home, directions={})
+    return task
+
+
+def _keyframe_turned(
+    ik: IK,
+    before: Keyframe,
+    step: Step,
+    held: tuple[Contact, ...],
+    options: KeyframeOptions,
+) -> Keyframe:
+    """A stable posture with the new contact as the unloaded robot reaches it."""
+    assert step.makes is not None
+    contact, solution = approach_contact(
+        ik, held, step.makes, before.q, step.seeds.touching
+    )
+    ik.kin.update(solution.q)
+    turned = replace(contact, quaternion=orientation_at(ik.kin, contact))
+    fixed = replace(_task(ik.world, before, step, held), new=(turned,), fixed=True)
+    return direct(ik, fixed, solution.q, options)
 
 
 def _keyframe_there(

@@ -198,7 +198,7 @@ def finish(
             surface=c.surface,
             support=c.support,
             position=world.supports[c.support].project(p),
-            quaternion=_orientation(kin, c),
+            quaternion=orientation_at(kin, c),
             link=quat_from_matrix(kin.rotation(world.surfaces[c.surface].body)),
         )
         for c, p in zip(task.new, places, strict=True)
@@ -233,7 +233,7 @@ def finish(
     )
 
 
-def _orientation(kin: Kinematics, c: Contact) -> np.ndarray:
+def orientation_at(kin: Kinematics, c: Contact) -> np.ndarray:
     """The contact's orientation: as reached by a flat surface, else as demonstrated."""
     s = kin.world.surfaces[c.surface]
     if s.rotation is None:
