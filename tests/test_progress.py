@@ -59,7 +59,8 @@ def test_where_stages_cost_what_is_known_a_share_of_the_time_is_that_of_the_bar(
     end = seen[-1][0]
     for now, share, left in seen:
         assert share == pytest.approx(now / end, abs=0.06)
-        if left is not None and 0.1 < share:
+        assert (left is None) == (share < progress.EARLY)
+        if left is not None:
             assert left == pytest.approx(end - now, abs=0.12 * end)
 
 

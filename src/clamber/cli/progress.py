@@ -31,7 +31,7 @@ COSTS = {
     "report": 2.0,
     "sweep": 200.0,
 }
-EARLY = 0.5  # [s] before which nothing can be said of the time left
+EARLY = 0.1  # share before which nothing can be said of the time left
 
 
 class Track:
@@ -83,7 +83,7 @@ class Track:
     def _estimate(self) -> None:
         """The time left, which is corrected downwards alone."""
         spent = self._clock() - self._began
-        if spent > EARLY and self.share > 0.0:
+        if self.share >= EARLY:
             left = spent * (1.0 - self.share) / self.share
             self.left = left if self.left is None else min(self.left, left)
 
