@@ -342,7 +342,7 @@ class RobotCommand:
         if out is not None:
             try:
                 out.mkdir(parents=True, exist_ok=True)
-            clamber.draw_robot(robot, out / "robot.png")
+                clamber.draw_robot(robot, out / "robot.png")
             except ClamberError as e:  # the robot is checked all the same
                 notes.append(str(e))
         record = {
