@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import functools
-import io
 import json
 import os
 import pty
@@ -25,7 +24,6 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 import clamber
 from clamber import cli
@@ -245,29 +243,6 @@ def test_the_last_line_is_wrapped_for_a_person_and_whole_for_a_file(
     lines = plain(capsys.readouterr().out)
     assert len(lines) == 3
     assert max(map(len, lines)) <= COLUMNS
-
-
-def test_progress_on_a_log_is_one_line_for_each_tenth():
-    log = io.StringIO()
-    report = output.progress_lines(Console(file=log, width=80))
-    for k in range(200):
-        report("plan", k / 200, f"move {k}")
-    report("simulate", 1.0, "")
-    lines = log.getvalue().splitlines()
-    assert len(lines) == 11
-    assert lines[0] == "plan   0 % move 0"
-    assert lines[-1] == "simulate 100 %"
-
-
-def test_progress_on_a_terminal_shows_stage_share_and_time_left():
-    screen = io.StringIO()
-    console = Console(file=screen, width=100, force_terminal=True)
-    with output.progress_bars(console) as report:
-        report("plan", 0.0, "LHand")
-        report("plan", 0.5, "[RHand]")
-        report("simulate", 0.2, "")
-    for word in ("plan", "simulate", "100%", "0:00:00"):
-        assert word in screen.getvalue()
 
 
 def test_the_clock_adds_up_what_was_tried_again(monkeypatch: Patch):

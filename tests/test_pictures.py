@@ -18,11 +18,13 @@ import clamber
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
-from clamber.model.scene import Scene
+from clamber.model.scene import Box, Scene
+from clamber.model.world import World, build_world
 from clamber.planning.records import Plan
 from clamber.run import folder as run_files
-from clamber.show import pictures, renderer
-from clamber.show.sample import force_by_contact, thinned
+from clamber.show import film, marks, pictures, renderer
+from clamber.show.sample import force_by_contact
+from clamber.show.skeleton import skeleton_of
 
 SIZE = (160, 120)
 
@@ -31,6 +33,10 @@ SIZE = (160, 120)
 def opengl() -> None:
     if renderer.gl_backend() is None:
         pytest.skip("no OpenGL here")
+
+
+def in_view(world: World, postures: np.ndarray) -> np.ndarray:
+    return renderer.seen_points(Kinematics(world), postures)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -58,7 +64,7 @@ def test_the_nearest_view_has_every_point_in_and_one_on_the_border(
 def test_points_are_drawn_where_the_projection_says(plan: Plan, opengl: None):
     size = (320, 240)
     world = plan.world
-    view = renderer.view_of(world, [world.home], size[0] / size[1])
+    view = renderer.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
     kin = Kinematics(world)
     kin.update(world.home)
     with renderer.Camera(world, size) as camera:
@@ -76,7 +82,7 @@ def foot_of(plan: Plan) -> tuple[int, np.ndarray]:
 
 def test_the_whole_robot_is_in_view_in_every_posture(plan: Plan, rollout: Rollout):
     postures = rollout.qpos[::50]
-    view = renderer.view_of(plan.world, postures, 4 / 3)
+    view = renderer.view_of(plan.world, in_view(plan.world, postures), 4 / 3)
     kin = Kinematics(plan.world)
     for q in postures:
         kin.update(q)
@@ -85,16 +91,19 @@ def test_the_whole_robot_is_in_view_in_every_posture(plan: Plan, rollout: Rollou
         assert np.all(seen < [640, 480])
 
 
-def test_the_near_edge_is_the_one_before_the_start():
+def test_all_of_a_near_box_is_seen_and_of_a_large_one_what_is_near():
+    motion = np.array([[0.0, -0.3, 0.0], [0.5, 0.3, 1.0]])
     scene = Scene.from_height(0.3)
-    edge = renderer.near_edge_points(scene)
-    np.testing.assert_allclose(edge[:, 0], 0.23)
-    np.testing.assert_allclose(sorted(set(edge[:, 2].round(9))), [0.0, 0.3])
-    np.testing.assert_allclose(np.abs(edge[:, 1]), renderer.EDGE_SHOWN)
-    left = replace(scene, start=np.array([0.73, -2.0, 0.0]))
-    np.testing.assert_allclose(renderer.near_edge_points(left)[:, 1], -0.6)
+    corners = renderer.obstacle_points(scene, motion)
+    near = renderer.NEAR * 1.0
+    assert corners[:, 0].min() == pytest.approx(0.23)
+    assert corners[:, 0].max() == pytest.approx(0.5 + near)  # of 1.23
+    np.testing.assert_allclose(sorted(set(corners[:, 2].round(9))), [0.0, 0.3])
+    np.testing.assert_allclose(np.abs(corners[:, 1]), 0.6)
+    far = motion + np.array([0.0, 5.0, 0.0])
+    assert len(renderer.obstacle_points(scene, far)) == 0
     nothing = Scene(start=np.zeros(3))
-    assert renderer.near_edge_points(nothing).shape == (0, 3)
+    assert renderer.obstacle_points(nothing, motion).shape == (0, 3)
 
 
 # Words.
@@ -107,7 +116,7 @@ def test_a_caption_gives_the_figures_of_the_keyframe(plan: Plan):
     d = next(c for c in last.contacts if c.contact.surface == "LHand")
     assert f"d LHand {1000 * d.projected_distance:.0f} mm" in geometry
     assert f"CoM margin {1000 * last.com_margin:.0f} mm" in geometry
-    assert f"{last.equilibrium.margin:.2f} weights" in balance
+    assert f"{last.equilibrium.margin:.2f} m g" in balance
     assert str(last.equilibrium.limiting) in balance
     assert pictures.keyframe_caption(0, first, None)[0] == "0  start, on LFoot, RFoot"
 
@@ -123,8 +132,8 @@ def test_forces_of_the_contacts_carry_the_weight(plan: Plan):
     ("seconds", "speedup"), [(3.0, 1), (12.0, 1), (14.0, 1), (46.0, 4), (270.0, 32)]
 )
 def test_long_runs_are_shown_faster_by_a_power_of_two(seconds: float, speedup: int):
-    assert renderer.speedup_of(seconds) == speedup
-    assert seconds / speedup <= renderer.VIDEO_SECONDS
+    assert film.speedup_of(seconds) == speedup
+    assert seconds / speedup <= film.VIDEO_SECONDS
 
 
 # Files.
@@ -159,13 +168,15 @@ def test_a_plan_alone_shows_its_keyframes_with_their_contacts(
 ):
     run_files.save_plan(plan, tmp_path)
     assert [f.name for f in pictures.render_run(tmp_path)] == ["keyframes.png"]
-    green = pictures.PHASE_COLOURS["supporting"]
+    green = marks.PHASE_COLOURS["supporting"]
     sheet = pixels(tmp_path / "keyframes.png")
     assert np.all(sheet == green, axis=2).sum() > 100
 
 
 def test_the_picture_of_another_posture_differs(plan: Plan, opengl: None):
-    view = renderer.view_of(plan.world, [k.q for k in plan.keyframes], 4 / 3)
+    view = renderer.view_of(
+        plan.world, in_view(plan.world, np.array([k.q for k in plan.keyframes])), 4 / 3
+    )
     with renderer.Camera(plan.world, SIZE) as camera:
         a, b, c = (
             np.asarray(camera.shot(plan.keyframes[i].q, view)) for i in (0, -1, 0)
@@ -190,13 +201,13 @@ def test_a_video_has_as_many_pictures_as_its_length_asks(
     plan: Plan, rollout: Rollout, tmp_path: Path, opengl: None
 ):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    path = renderer.video(plan, short(rollout), tmp_path)
+    path = film.video(plan, short(rollout), tmp_path)
     assert path.name == "video.mp4"
     frames = ffmpeg.read_frames(str(path))
     about = next(frames)
-    assert about["size"] == renderer.VIDEO_SIZE
-    assert about["fps"] == renderer.FPS
-    assert len(list(frames)) == 10
+    assert about["size"] == film.VIDEO_SIZE
+    assert about["fps"] == film.FPS
+    assert len(list(frames)) == 8
     assert len(path.read_bytes()) > 1000
 
 
@@ -208,11 +219,11 @@ def test_without_ffmpeg_the_video_is_a_webp(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    path = renderer.video(plan, short(rollout), tmp_path)
+    path = film.video(plan, short(rollout), tmp_path)
     assert path.name == "video.webp"
     with Image.open(path) as picture:
-        assert picture.n_frames == 5
-        assert picture.size == (480, 360)
+        assert picture.n_frames == 4
+        assert picture.size == film.WEBP_SIZE
 
 
 def test_without_opengl_plots_are_drawn_and_the_reason_is_one_sentence(
@@ -318,9 +329,9 @@ def test_from_no_side_is_the_ground_white(
 def test_a_frame_shows_the_state_at_its_time(
     run: Path, rollout: Rollout, tmp_path: Path, opengl: None
 ):
-    a = pictures.render_frame(run, 1.0, size=SIZE, out=tmp_path / "a.png")
+    a = pictures.render_frame(run, 1.0, size=SIZE, marks="none", out=tmp_path / "a.png")
     size = SIZE[0] / SIZE[1]
-    view = renderer.view_of(rollout.world, thinned(rollout.qpos, 60), size)
+    view = renderer.view_of(rollout.world, in_view(rollout.world, rollout.qpos), size)
     row = int(np.argmin(np.abs(rollout.time - 1.0)))
     with renderer.Camera(rollout.world, SIZE) as camera:
         wanted = np.asarray(camera.shot(rollout.qpos[row], view)).astype(int)
@@ -351,7 +362,7 @@ def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(
         rgba = np.asarray(picture).astype(int)
     alpha = rgba[..., 3]
     world = rollout.world
-    view = renderer.view_of(world, thinned(rollout.qpos, 60), size[0] / size[1])
+    view = renderer.view_of(world, in_view(world, rollout.qpos), size[0] / size[1])
     kin = Kinematics(world)
     kin.update(rollout.qpos[0])
     x, y = view.project(kin.com, size).round().astype(int)
@@ -378,7 +389,7 @@ def test_a_picture_has_the_ending_of_its_format(
     with pytest.raises(InputError, match=r"ends in \.png"):
         pictures.render_frame(run, 0.0, out=run / "a.gif")
     with pytest.raises(InputError, match=r"\.mp4 or \.webp"):
-        renderer.video(plan, rollout, run, out=run / "a.avi")
+        film.video(plan, rollout, run, out=run / "a.avi")
 
 
 def test_an_mp4_without_ffmpeg_says_what_brings_it(
@@ -386,7 +397,7 @@ def test_an_mp4_without_ffmpeg_says_what_brings_it(
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(clamber.MissingDependency, match=r"clamber\[video\]"):
-        renderer.video(plan, rollout, run, out=run / "a.mp4")
+        film.video(plan, rollout, run, out=run / "a.mp4")
 
 
 def test_a_video_has_the_size_and_side_that_was_asked(
@@ -394,7 +405,7 @@ def test_a_video_has_the_size_and_side_that_was_asked(
 ):
     frames = {}
     for camera in ("corner", "behind"):
-        path = renderer.video(
+        path = film.video(
             plan,
             short(rollout),
             tmp_path,
@@ -406,3 +417,123 @@ def test_a_video_has_the_size_and_side_that_was_asked(
             assert picture.size == (200, 120)
             frames[camera] = np.asarray(picture.convert("RGB")).astype(int)
     assert np.abs(frames["corner"] - frames["behind"]).mean() > 5
+
+
+# What is seen.
+
+
+def orange(picture: np.ndarray) -> np.ndarray:
+    """(h, w) bool, where the accent of a COMAN's surfaces is."""
+    r, g, b = (picture[..., k].astype(int) for k in range(3))
+    return (r > 1.5 * g) & (g > 1.3 * b) & (r > 70)
+
+
+SCENES = {
+    "low": Scene.from_height(0.1),
+    "usual": Scene.from_height(0.275),
+    "wide": Scene(
+        start=np.zeros(3),
+        boxes=(
+            Box(
+                name="street",
+                size=np.array([30.0, 20.0, 0.4]),
+                position=np.array([15.3, 0.0, 0.2]),
+                rotation=np.eye(3),
+            ),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("robot", ["coman", "coman29"])
+def test_the_whole_robot_is_in_the_picture_and_fills_its_share(
+    scene: str, robot: str, opengl: None
+):
+    """At the start, half way and at the end of a way of a metre and a half."""
+    world = build_world(clamber.load_robot(robot), SCENES[scene])
+    ways = np.tile(world.home, (3, 1))
+    ways[:, 0] += np.linspace(0.0, 1.5, 3)
+    ways[:, 2] += np.linspace(0.0, 0.4, 3)
+    size = (320, 180)
+    view = renderer.view_of(world, in_view(world, ways), size[0] / size[1])
+    with renderer.Camera(world, size) as camera:
+        for q in ways:
+            found = np.asarray(camera.cutout(q, view))
+            accent = orange(found) & (found[..., 3] > 200)
+            assert accent.sum() > 12, "the robot is not there"
+            rows, columns = np.nonzero(accent)
+            kin = Kinematics(world)
+            kin.update(q)
+            at = view.project(renderer.robot_corners(kin), size)
+            assert at.min() > 0
+            assert np.all(at.max(axis=0) < size)
+            assert np.all(at.min(axis=0)[1] - 2 <= rows.min())
+            assert np.ptp(at[:, 1]) > 0.18 * size[1]
+            assert columns.max() < size[0] - 1
+
+
+def test_a_frame_shows_its_contacts_and_their_forces_on_request(
+    run: Path, tmp_path: Path, opengl: None
+):
+    size, green = (480, 360), marks.PHASE_COLOURS["supporting"]
+    count = {}
+    for which in ("none", "contacts", "forces"):
+        path = pictures.render_frame(
+            run, 0.3, size=size, marks=which, out=tmp_path / f"{which}.png"
+        )
+        count[which] = int(np.all(pixels(path) == green, axis=2).sum())
+    assert count["none"] == 0
+    assert count["contacts"] > 60
+    assert count["forces"] > 1.2 * count["contacts"]
+    usual = pictures.render_frame(run, 0.3, size=size, out=tmp_path / "usual.png")
+    assert np.array_equal(pixels(usual), pixels(tmp_path / "contacts.png"))
+
+
+def test_the_person_is_beside_the_robot_in_a_video_and_called_synthetic(
+    plan: Plan, rollout: Rollout, opengl: None
+):
+    demo = clamber.load_demo("climb")
+    skeleton = skeleton_of(demo, clamber.detect_contacts(demo))
+    size = (320, 180)
+    frames = [
+        np.asarray(x)
+        for x in film._frames(
+            plan, short(rollout), 20.0, size, "corner", "none", skeleton, _silent
+        )
+    ]
+    for picture in (frames[0], frames[-1]):
+        r, g, b = (picture[..., k].astype(int) for k in range(3))
+        person = (b > 1.3 * g) & (g > 1.15 * r)
+        assert person.sum() > 100
+        columns = np.nonzero(person)[1]
+        assert columns.min() > 0
+        robot = np.nonzero(orange(picture))[1]
+        assert len(robot) > 20
+        assert np.median(columns) < np.median(robot) - 0.15 * size[0]
+    points = in_view(rollout.world, rollout.qpos)
+    who = film.Person(skeleton, rollout.world, points, "corner")
+    assert who.name == "person (synthetic)"
+
+
+def _silent(stage: str, share: float, note: str) -> None:
+    pass
+
+
+def test_shadows_are_soft_and_lie_on_the_ground(plan: Plan, opengl: None):
+    world, size = plan.world, (320, 240)
+    view = renderer.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
+    with renderer.Camera(world, size) as camera:
+        shaded = np.asarray(camera.shot(world.home, view)).astype(int)
+        plain = np.asarray(camera._drawn(camera._frame).resize(size)).astype(int)
+    darker = 1.0 - shaded.sum(axis=2) / np.maximum(plain.sum(axis=2), 1)
+    assert darker.max() > 0.25
+    assert np.mean(darker > 0.25) > 0.005
+    edge = (darker > 0.04) & (darker < 0.2)
+    assert edge.sum() > 0.1 * (darker > 0.25).sum()  # not a step
+
+
+def test_no_phase_of_a_contact_is_red():
+    """What the thesis calls sliding is held by friction in a run that succeeds."""
+    for r, g, b in marks.PHASE_COLOURS.values():
+        assert not (r > 180 and g < 100 and b < 100)

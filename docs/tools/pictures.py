@@ -20,7 +20,7 @@ from clamber.execution.terrain import fitted_box
 from clamber.model.kinematics import Kinematics
 from clamber.run.figures import finish_axes, save_plot
 from clamber.show.pictures import mark_keyframe
-from clamber.show.renderer import Camera, view_of
+from clamber.show.renderer import Camera, seen_points, view_of
 from clamber.step.polygon import support_ellipse, support_polygon
 from clamber.step.posture import STABILITY_WEIGHT
 
@@ -320,7 +320,9 @@ def feeling(plan) -> Figure:
 def keyframe(plan, k: int, path: Path) -> None:
     """One keyframe with its contacts, their forces and the centre of mass."""
     size = (900, 560)
-    view = view_of(plan.world, [plan.keyframes[k].q], size[0] / size[1], "corner")
+    posture = plan.keyframes[k].q[None]
+    seen = seen_points(Kinematics(plan.world), posture)
+    view = view_of(plan.world, seen, size[0] / size[1], "corner")
     with Camera(plan.world, size) as camera:
         picture = camera.shot(plan.keyframes[k].q, view)
     mark_keyframe(picture, view, plan.world, plan.keyframes[k])

@@ -19,19 +19,19 @@ Report = Callable[[str, float, str], None]
 # processor, by `time.process_time` between the reports of each stage. What a stage
 # costs on another machine, or for another robot, differs by about the same factor.
 COSTS = {
-    "detect": 0.5,
-    "plan": 0.4,
-    "trajectory": 0.2,
-    "save": 1.0,
-    "simulate": 3.0,
-    "save run": 1.0,
-    "pictures": 9.0,
-    "video": 40.0,
+    "detect": 0.2,
+    "plan": 0.2,
+    "trajectory": 0.1,
+    "save": 0.3,
+    "simulate": 2.0,
+    "save run": 0.8,
+    "pictures": 5.2,
+    "video": 34.0,
     "draw": 2.0,
     "report": 2.0,
     "sweep": 200.0,
 }
-EARLY = 0.5  # [s] before which nothing can be said of the time left
+EARLY = 0.1  # share before which nothing can be said of the time left
 
 
 class Track:
@@ -83,7 +83,7 @@ class Track:
     def _estimate(self) -> None:
         """The time left, which is corrected downwards alone."""
         spent = self._clock() - self._began
-        if spent > EARLY and self.share > 0.0:
+        if self.share >= EARLY:
             left = spent * (1.0 - self.share) / self.share
             self.left = left if self.left is None else min(self.left, left)
 
@@ -111,11 +111,14 @@ def bar(console: Console, track: Track, *, more: bool = False) -> Iterator[Repor
     with Progress(*columns, console=console, transient=more) as bars:
         task = bars.add_task("", total=1.0, left="", note="")
         bars.update(task, completed=track.share)
+        shown = [""]
 
         def report(stage: str, done: float, note: str) -> None:
             track.update(stage, done)
+            fresh, shown[0] = stage != shown[0], stage
             bars.update(
                 task,
+                refresh=fresh,
                 description=stage,
                 completed=track.share,
                 left=str(track),

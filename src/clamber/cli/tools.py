@@ -341,6 +341,7 @@ class RobotCommand:
             table.add_row(*chain, ", ".join(limb.surfaces), length)
         if out is not None:
             try:
+                out.mkdir(parents=True, exist_ok=True)
                 clamber.draw_robot(robot, out / "robot.png")
             except ClamberError as e:  # the robot is checked all the same
                 notes.append(str(e))

@@ -95,7 +95,7 @@ def _height_figure(
 
 
 def stability_plot(motion: Motion, asked: float, path: str | Path) -> Path:
-    """Projected distances of loaded contacts, and the CoM's margin, with limits.
+    """Projected distances of loaded contacts, the CoM's margin, and guide values.
 
     Args:
         motion: Of physics, or of a plan.
@@ -118,7 +118,7 @@ def stability_plot(motion: Motion, asked: float, path: str | Path) -> Path:
         ax.set_title(f"{limb} ({top})", fontsize=9, loc="left")
         ax.set_xlim(t[0], t[-1])
         ax.set_ylim(0.0, 1.3 * max(0.1, float(np.nanmax(np.append(limit, d)))))
-        ax.set_ylabel("d [m]; dashed: limit", fontsize=8)
+        ax.set_ylabel("d [m]; dashed: guide value", fontsize=8)
         finish_axes(ax)
     ax = fig.add_subplot(grid[2, :])
     ax.plot(t, margin, color="0.15", lw=1.2, label="CoM inside the support polygon")

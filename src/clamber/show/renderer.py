@@ -26,9 +26,10 @@ from PIL import Image, ImageChops, ImageFilter
 from clamber.errors import ClamberError
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
+from clamber.model.se3 import matrix_from_quat
 from clamber.model.world import World
 from clamber.planning.trajectory import Samples
-from clamber.show.meshes import SHOWN_GROUPS
+from clamber.show.meshes import SHOWN_GROUPS, geom_colour
 from clamber.show.sample import thinned
 
 Preset = Literal["corner", "side", "front", "behind", "top"]
@@ -58,6 +59,9 @@ HORIZON, GROUND_COLOUR, GRID_COLOUR = (
 GRID_LINE = 3  # of the 256 texels of a square
 BOX_COLOUR: Colour = (0.80, 0.68, 0.53, 1.0)
 PAD_COLOUR: Colour = (0.13, 0.14, 0.16, 1.0)
+CAP_DARK: Colour = (0.16, 0.17, 0.20, 1.0)
+CAP_PALE: Colour = (0.66, 0.69, 0.73, 1.0)
+CAP_NEAR, CAP_REACH, CAP_SHARE = 0.8, 0.95, 0.5  # [radius of the shape around a joint]
 EDGE_COLOUR: Colour = (0.32, 0.26, 0.20, 1.0)
 EDGE_LIFT, EDGE_WIDTH = 0.002, 1.5  # [m], [pixels]
 MOST_EDGED = 40  # boxes; of more, as of a terrain, the edges are left out
@@ -206,6 +210,7 @@ class Camera:
             for b in (boxes if len(boxes) <= MOST_EDGED else ())
             for edge in _edges(b.size, b.position, b.rotation)
         ]
+        self._caps = _joint_caps(model, world)
         self._frame = (width, height)
         self._shade = (width, height) if fine else (size[0] // 2, size[1] // 2)
 
@@ -277,7 +282,11 @@ class Camera:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             scene,
         )
-        for shape in (*shapes, *self._edges):
+        for shape in (
+            *shapes,
+            *self._edges,
+            *(c.shape(self._data) for c in self._caps),
+        ):
             if scene.ngeom < scene.maxgeom:
                 shape(scene.geoms[scene.ngeom])
                 scene.ngeom += 1
@@ -372,6 +381,68 @@ def _edges(
             ends[:, (axis + 2) % 3] = b * half[(axis + 2) % 3]
             ends = centre + ends @ rotation.T
             yield bar(mujoco.mjtGeom.mjGEOM_LINE, ends, EDGE_WIDTH, EDGE_COLOUR)
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Cap:
+    """The ends of a joint's axle, seen on both sides of the shape around it.
+
+    Attributes:
+        body: Body id.
+        ends: (2, 3) in its frame [m].
+        radius: [m].
+        colour: Other than that of the shape.
+    """
+
+    body: int
+    ends: np.ndarray
+    radius: float
+    colour: Colour
+
+    def shape(self, data: mujoco.MjData) -> Shape:
+        """As it is drawn at the present posture."""
+        R = data.xmat[self.body].reshape(3, 3)
+        ends = data.xpos[self.body] + self.ends @ R.T
+        return bar(mujoco.mjtGeom.mjGEOM_CYLINDER, ends, self.radius, self.colour)
+
+
+def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
+    """Axles of the hinges that lie in a ball or a capsule of their link.
+
+    A robot drawn with meshes has its own.
+    """
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+    if np.any(own & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)):
+        return []
+    round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+    round_ones = own & np.isin(model.geom_type, [k.value for k in round_ones])
+    caps = []
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
+        body, at, axis = int(model.jnt_bodyid[j]), model.jnt_pos[j], model.jnt_axis[j]
+        for g in np.flatnonzero(round_ones & (model.geom_bodyid == body)):
+            radius, half = float(model.geom_size[g, 0]), 0.0
+            along = matrix_from_quat(model.geom_quat[g])[:, 2]
+            if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE:
+                half = float(model.geom_size[g, 1])
+            centre, reach = model.geom_pos[g], CAP_REACH * radius
+            foot = centre + np.clip((at - centre) @ along, -half, half) * along
+            if np.linalg.norm(at - foot) > CAP_NEAR * radius:
+                continue
+            if abs(float(along @ axis)) > 0.8:
+                reach += half  # the capsule is the axle's own
+            else:
+                centre = foot
+            dark = geom_colour(model, int(g))[:3].mean() < 0.4
+            caps.append(
+                _Cap(
+                    body=body,
+                    ends=centre + np.outer([-reach, reach], axis),
+                    radius=CAP_SHARE * radius,
+                    colour=CAP_PALE if dark else CAP_DARK,
+                )
+            )
+            break
+    return caps
 
 
 def _dressed(world: World, size: tuple[int, int]) -> mujoco.MjModel:
