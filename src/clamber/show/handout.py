@@ -12,8 +12,8 @@ from PIL import Image
 from clamber.errors import ClamberError
 from clamber.execution.simulation import Rollout
 from clamber.planning.records import Plan
+from clamber.show.film import skeleton_of_plan, video
 from clamber.show.page import Page, Work
-from clamber.show.renderer import video
 from clamber.show.report import REPORT, write_report
 
 RENDER_SECONDS = 60.0  # [s] that a browser is waited for
@@ -81,4 +81,5 @@ class Handout:
         plan, rollout = self._shown()
         if rollout is None:
             raise ClamberError("No video: this plan has not been run in physics.")
-        return video(plan, rollout, there, report=self._work.report)
+        person = skeleton_of_plan(plan)
+        return video(plan, rollout, there, skeleton=person, report=self._work.report)

@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from clamber.contact.contact import ContactSequence
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.arguments import checks_types
 from clamber.model.terrain import SceneLike
 from clamber.planning.records import Plan
-from clamber.recording.built_in import BUILT_IN, source_of
+from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import PLAN, SEQUENCE, fallback_note, load_sequence
@@ -32,6 +31,7 @@ from clamber.show.skeleton import (
     Skeleton,
     corners,
     paired_times,
+    recording_named,
     skeleton_of,
     to_the_right,
 )
@@ -135,7 +135,10 @@ def _person_of(
             f"a run folder with {PLAN} or {SEQUENCE} ({'; '.join(run.missing)})",
             source=run.folder,
         )
-    named = _named_recording(sequence, run) if demo is None else demo
+    source = run.written.get("sequence", {}).get("source", "")
+    if sequence is not None:
+        source = sequence.source
+    named = recording_named(source) if demo is None else demo
     if named is None:
         return None
     recorded = run.attempt(lambda: load_demo(named, scene=scene))
@@ -161,17 +164,6 @@ def _show_run(
         _show_recording(page, person)
     if run.written or run.verdict:
         Handout(page, run.folder, None)
-
-
-def _named_recording(sequence: ContactSequence | None, run: Run) -> str | None:
-    """The recording that a run names as its source, where it can be found."""
-    source = run.written.get("sequence", {}).get("source", "")
-    if sequence is not None:
-        source = sequence.source
-    for name in BUILT_IN:
-        if source == source_of(name):
-            return name
-    return source if source and Path(source).is_file() else None
 
 
 def _show_recording(page: Page, skeleton: Skeleton) -> None:
