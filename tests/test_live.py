@@ -202,6 +202,8 @@ def test_help_and_import_do_without_viser():
         ({"source": "climb", "host": "203.0.113.7"}, "--host"),
         ({"source": "climb", "port": 70000}, "--port"),
         ({"source": "climb", "demo": "climb"}, "climb"),
+        ({"source": "climb", "beside": ["climb"]}, "climb"),
+        ({"demo": "climb"}, "climb"),
     ],
 )
 def test_what_cannot_be_served_is_named(options: dict[str, Any], source: str):
@@ -254,6 +256,27 @@ def test_a_port_in_use_takes_the_next_one(whole: Path):
         page.close()
     assert page.host == "127.0.0.1"
     assert page.wanted == taken < page.port < taken + 50
+
+
+@pytest.mark.parametrize(
+    ("words", "source", "beside"),
+    [((), None, []), (("a",), "a", []), (("a", "b", "c"), "a", ["b", "c"])],
+)
+def test_the_command_shows_one_run_others_beside_it_or_how_to_begin(
+    words: tuple[str, ...],
+    source: str | None,
+    beside: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    asked: list[tuple[str | None, list[str]]] = []
+
+    def opened(source: str | None, *, beside: list[str], **_: Any) -> None:
+        asked.append((source, beside))
+        raise InputError("nothing more")
+
+    monkeypatch.setattr("clamber.show.live.open_view", opened)
+    assert cli.main(["view", *words]) == 2
+    assert asked == [(source, beside)]
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,8 @@ def served(
         tab.add_style_tag(content=".mantine-Notification-root {display: none}")
         opened = Opened(page=page, tab=tab, complaints=complaints)
         yield opened
-        assert complaints == []
+        if complaints:
+            pytest.fail(str(complaints))
         tab.context.close()
     finally:
         page.close()

@@ -51,14 +51,16 @@ class Chart:
             motion: What is on the page at present.
         """
         self._page, self._motion, self._plot = page, motion, None
+        self._title = ""
         gui = page.server.gui
         with gui.add_folder("Over time", expand_by_default=False) as self._folder:
             self._choice: Any = gui.add_dropdown("plot", ("",))
-        self._choice.on_update(lambda _: self._draw())
-        self.renew()
+        self._choice.on_update(lambda _: self._chosen())
+        with page.clock.lock:
+            self.renew()
 
     def renew(self) -> None:
-        """There is another motion to plot."""
+        """There is another motion to plot; the clock's lock is held."""
         self._all, chosen = series_of(self._motion()), str(self._choice.value)
         self._choice.options = tuple(self._all)
         self._choice.value = chosen if chosen in self._all else next(iter(self._all))
@@ -69,10 +71,17 @@ class Chart:
         if self._plot is not None:
             self._plot.data = (*self._data, self._mark(t))
 
+    def _chosen(self) -> None:
+        """Another one, where that is not the page's own doing."""
+        with self._page.clock.lock:
+            if str(self._choice.value) != self._title:
+                self._draw()
+
     def _draw(self) -> None:
         """The plot that is chosen, in place of the one before."""
         time = self._motion().time
-        series = self._all[str(self._choice.value)]
+        self._title = str(self._choice.value)
+        series = self._all[self._title]
         rows = np.unique(np.linspace(0, len(time) - 1, min(MOST, len(time))).round())
         rows = rows.astype(int)
         lines = peaks(np.column_stack([*series.values()]), rows)

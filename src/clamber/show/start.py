@@ -91,10 +91,12 @@ class Choice:
             UPLOADS.mkdir(parents=True, exist_ok=True)
             file = next_free_folder(UPLOADS, Path(name).stem) / Path(name).name
             file.write_bytes(content)
+            name = f"{file.parent.name}{file.suffix}"  # of two alike, another one
             self._known[name] = self._brought(file)
         except (ClamberError, OSError) as e:
             self.say(str(e))
             return
+        self.say("")
         self._choice.options = tuple(self._known)
         self._choice.value = name
 
