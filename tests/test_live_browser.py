@@ -123,10 +123,11 @@ def test_each_mode_changes_the_picture_and_leaves_the_robot_in_it(
 ):
     """Half way, where all of them have something to show; at rest and in motion."""
     clock, on = view.page.clock, not LAYERS.get(mode, False)
-    view.click("front" if mode == "planned posture" else "corner")
+    (client,) = view.page.server.get_clients().values()
+    view.page.aim(client, "front" if mode == "planned posture" else "corner")
     clock.go(0.4 * clock.end)
-    view.tab.wait_for_timeout(600)
-    before = view.picture()
+    view.tab.wait_for_timeout(1500)
+    before = view.still()
     view.switch(mode, on)
     changed = 200 if mode in ("shadows", "see-through robot") else 8
     view.until(

@@ -72,6 +72,17 @@ class Opened:
         shot = self.tab.screenshot(clip=clip or SCENE)
         return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
+    def still(self) -> np.ndarray:
+        """The picture, once it changes no more."""
+        before = self.picture()
+        for _ in range(40):
+            self.tab.wait_for_timeout(200)
+            now = self.picture()
+            if np.array_equal(before, now):
+                return now
+            before = now
+        pytest.fail("it does not come to rest")
+
     def orange(self) -> int:
         """Pixels of the robot."""
         return int(np.sum(orange_in(self.picture())))
