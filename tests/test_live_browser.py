@@ -141,10 +141,13 @@ def test_each_mode_changes_the_picture_and_leaves_the_robot_in_it(
     clock.go(0.4 * clock.end)
     view.switch(mode, not on)
     assert min(counts) > ENOUGH / faded, counts
-    view.until(
-        lambda: np.sum(np.abs(before - view.picture()).max(axis=2) > 12) <= changed,
-        "as it was",
-    )
+    view.until(lambda: alike(before, view.picture()), "as it was")
+
+
+def alike(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether pictures are, in blocks: a busy browser draws them less sharply."""
+    blocks = (x[:600].reshape(30, 20, 26, 20, 3).mean(axis=(1, 3)) for x in (a, b))
+    return bool(np.abs(next(blocks) - next(blocks)).max() < 12)
 
 
 SIZES = {
