@@ -61,7 +61,7 @@ def measure(
     tab.set_default_timeout(120_000)
     try:
         tab.goto(page.url)
-        tab.wait_for_selector("text=speed")
+        tab.wait_for_selector('text="speed"')
         tab.get_by_text("Show", exact=True).click()
         for name, on in layers.items():
             row = tab.get_by_text(name, exact=True).locator("xpath=../../..")

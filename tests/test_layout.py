@@ -35,7 +35,8 @@ FLOORS = [
     ["planning"],
     ["execution"],
     ["run"],
-    ["show", "study"],
+    ["study"],
+    ["show"],
     ["", "cli", "__main__"],  # the package itself: its public names
 ]
 FLOOR_OF = {room: i for i, rooms in enumerate(FLOORS) for room in rooms}

@@ -20,10 +20,11 @@ from clamber.errors import InputError, MissingDependency
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.show import editor
+from clamber.show.editor import Edits
 from clamber.show.live import open_view
 from clamber.show.page import Clock, paragraphs
 from clamber.show.sample import keyframe_times
-from clamber.show.skeleton import beside, paired_times, skeleton_of
+from clamber.show.skeleton import paired_times, skeleton_of, to_the_right
 
 NASTY = "<img src=x onerror=alert(1)>"
 
@@ -49,10 +50,10 @@ def test_a_skeleton_stands_where_it_was_recorded(demo_sequence: Any):
     assert skeleton.changes()[0] == demo.t[0]
 
 
-def test_beside_leaves_a_gap_between_the_boxes():
+def test_what_is_put_to_the_right_leaves_a_gap_between_the_boxes():
     a, b = Scene.from_height(0.25), Scene.from_height(0.5)
     points = np.zeros((1, 3))
-    way = beside(a, points, b, points)
+    way = to_the_right(a, points, b, points)
     assert way[1] == pytest.approx(-(0.6 + 0.6 + 0.3))
     assert way[0] == pytest.approx(0.0)
 
@@ -72,30 +73,55 @@ def test_a_contact_that_is_moved_is_planned_where_it_was_put(one_hand_plan: Plan
     ((name, hand),) = editor.intervals_of(one_hand_plan).items()
     assert hand.contact.surface == "LHand"
     place = hand.planned + np.array([0.04, 0.03, 0.1])
-    again = editor.plan_edited(one_hand_plan, {name: place}, ())
+    again = editor.plan_edited(one_hand_plan, Edits(moved={name: ("box", place)}))
     assert again.complete
     made = next(c for c in again.keyframes[1].stance if c.surface == "LHand")
     np.testing.assert_allclose(made.position[:2], place[:2], atol=0.005)
     assert made.position[2] == pytest.approx(0.25, abs=1e-3)
 
 
+def test_a_contact_that_is_moved_to_another_support_is_made_there(one_hand_plan: Plan):
+    (name,) = editor.intervals_of(one_hand_plan)
+    edits = Edits(moved={name: ("ground", np.array([0.15, 0.2, 0.1]))})
+    stance = editor.edited_sequence(one_hand_plan, edits).stances[1]
+    (hand,) = (c for c in stance.contacts if c.surface == "LHand")
+    assert hand.support == "ground"
+    np.testing.assert_allclose(hand.position, [0.15, 0.2, 0.0], atol=1e-9)
+
+
+def test_contacts_go_with_a_box_that_is_moved(one_hand_plan: Plan):
+    (box,) = one_hand_plan.world.scene.boxes
+    there = replace(box, position=box.position + 0.02 * np.eye(3)[0])
+    again = editor.plan_edited(one_hand_plan, Edits(boxes={"box": there}))
+    assert again.complete
+    assert again.world.scene.boxes[0].position[0] == pytest.approx(there.position[0])
+    a, b = (
+        next(c for c in p.sequence.stances[1].contacts if c.surface == "LHand")
+        for p in (one_hand_plan, again)
+    )
+    np.testing.assert_allclose(b.position - a.position, [0.02, 0, 0], atol=1e-6)
+
+
 def test_no_edit_is_the_same_plan(one_hand_plan: Plan):
-    again = editor.plan_edited(one_hand_plan, {}, ())
+    again = editor.plan_edited(one_hand_plan, Edits())
     for a, b in zip(again.keyframes, one_hand_plan.keyframes, strict=True):
         np.testing.assert_array_equal(a.q, b.q)
 
 
 def test_a_surface_that_is_off_makes_no_contact(one_hand_plan: Plan):
-    sequence = editor.edited_sequence(one_hand_plan, {}, {"LHand"})
+    sequence = editor.edited_sequence(one_hand_plan, Edits(off=frozenset({"LHand"})))
     assert not any("LHand" in s.surfaces for s in sequence.stances)
-    assert not editor.plan_edited(one_hand_plan, {}, {"LHand"}).complete
+    without = Edits(off=frozenset({"LHand"}))
+    assert not editor.plan_edited(one_hand_plan, without).complete
 
 
 def test_saving_writes_a_run_of_its_own_and_overwrites_nothing(
     one_hand_plan: Plan, tmp_path: Path
 ):
     ((name, hand),) = editor.intervals_of(one_hand_plan).items()
-    again = editor.plan_edited(one_hand_plan, {name: hand.planned}, ())
+    again = editor.plan_edited(
+        one_hand_plan, Edits(moved={name: ("box", hand.planned)})
+    )
     first, second = (editor.save_edited(tmp_path, again) for _ in range(2))
     assert [first.name, second.name] == ["edited", "edited-2"]
     elsewhere = tmp_path.parent / f"{tmp_path.name}-elsewhere"
@@ -176,6 +202,8 @@ def test_help_and_import_do_without_viser():
         ({"source": "climb", "host": "203.0.113.7"}, "--host"),
         ({"source": "climb", "port": 70000}, "--port"),
         ({"source": "climb", "demo": "climb"}, "climb"),
+        ({"source": "climb", "beside": ["climb"]}, "climb"),
+        ({"demo": "climb"}, "climb"),
     ],
 )
 def test_what_cannot_be_served_is_named(options: dict[str, Any], source: str):
@@ -228,6 +256,27 @@ def test_a_port_in_use_takes_the_next_one(whole: Path):
         page.close()
     assert page.host == "127.0.0.1"
     assert page.wanted == taken < page.port < taken + 50
+
+
+@pytest.mark.parametrize(
+    ("words", "source", "beside"),
+    [((), None, []), (("a",), "a", []), (("a", "b", "c"), "a", ["b", "c"])],
+)
+def test_the_command_shows_one_run_others_beside_it_or_how_to_begin(
+    words: tuple[str, ...],
+    source: str | None,
+    beside: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    asked: list[tuple[str | None, list[str]]] = []
+
+    def opened(source: str | None, *, beside: list[str], **_: Any) -> None:
+        asked.append((source, beside))
+        raise InputError("nothing more")
+
+    monkeypatch.setattr("clamber.show.live.open_view", opened)
+    assert cli.main(["view", *words]) == 2
+    assert asked == [(source, beside)]
 
 
 @pytest.mark.parametrize(

@@ -378,6 +378,14 @@ def settled(page: Any) -> None:
     )
 
 
+def read_through(page: Any) -> None:
+    """Scroll to the end, and back."""
+    for y in range(0, page.evaluate("document.documentElement.scrollHeight"), 500):
+        page.evaluate(f"window.scrollTo(0, {y})")
+        settled(page)
+    page.evaluate("window.scrollTo(0, 0)")
+
+
 def drawn(page: Any, which: int = 0) -> str:
     """The pixels of an animation, as a data URL."""
     settled(page)
@@ -459,6 +467,8 @@ def test_a_click_on_a_stance_jumps_there(page: tuple[Any, list[str]], plan: Plan
 
 def test_the_cursors_of_the_plots_follow_the_time(page: tuple[Any, list[str]]):
     p, _ = page
+    read_through(p)
+    until(p, "document.querySelectorAll('.plot').length === 8")
     p.evaluate("go(END / 4)")
     left = p.eval_on_selector_all(".cursor", "all => all.map((c) => c.style.left)")
     assert len(left) == 9  # the timeline and eight plots
@@ -467,6 +477,80 @@ def test_the_cursors_of_the_plots_follow_the_time(page: tuple[Any, list[str]]):
     middle = chart.bounding_box()["width"] / 2
     chart.click(position={"x": middle, "y": 60})
     assert p.evaluate("state.t / END") == pytest.approx(0.5, abs=0.01)
+
+
+LONG = 40  # times as long as the run of one hand
+
+
+@pytest.fixture(scope="module")
+def long_run(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of that run, over and over."""
+    record = report.run_record(whole)
+    motion, keys = record["motion"], record["keyframes"]
+    t = times(record)
+    every = float(t[-1] + t[1] - t[0])
+
+    def over(data: str, kind: str, step: float = 0.0) -> str:
+        x = np.frombuffer(base64.b64decode(data), kind)
+        again = np.concatenate([x + x.dtype.type(k * step) for k in range(LONG)])
+        return base64.b64encode(again.tobytes()).decode()
+
+    motion["times"] = over(motion["times"], "<f4", every)
+    for x in motion["arrays"].values():
+        if x is not None:
+            x["data"] = over(x["data"], "<i2")
+    record["keyframes"] = [
+        k | {"time": k["time"] + n * every} for n in range(LONG) for k in keys
+    ]
+    record["events"] = [{"time": 0.1 * k, "text": f"event {k}"} for k in range(100)]
+    file = tmp_path_factory.mktemp("long") / "report.html"
+    file.write_text(report.page([record]))
+    return file
+
+
+COUNTED = """() => ({
+  nodes: document.querySelectorAll("*").length,
+  stills: document.querySelectorAll("canvas[data-drawn]").length,
+  plots: document.querySelectorAll(".plot").length })"""
+MOST_POINTS = """() => Math.max(...[...document.querySelectorAll("path")].map(
+  p => (p.getAttribute("d").match(/[ML]/g) || []).length))"""
+
+
+def test_a_long_run_opens_with_what_is_on_the_screen_alone(
+    browser: Any, long_run: Path
+):
+    """Its stills and plots are made when they are seen; a plot has a column a pixel."""
+    p, complaints = opened(browser, long_run)
+    assert p.evaluate("MOTIONS[0].times.length") > 2000
+    counted = p.evaluate(COUNTED)
+    assert counted["stills"] < 12
+    assert counted["plots"] < 8
+    assert counted["nodes"] < 2000
+    read_through(p)
+    until(p, "document.querySelectorAll('.plot').length === 8")
+    until(p, "document.querySelectorAll('canvas[data-drawn]').length === 12")
+    assert 500 < p.evaluate(MOST_POINTS) <= 1010
+    assert complaints == []
+
+
+def test_a_long_list_is_turned_page_by_page(browser: Any, long_run: Path):
+    p, complaints = opened(browser, long_run)
+    sheet, stances, events = p.locator(".pager").all()
+    assert sheet.inner_text().split()[1:5] == ["0", "to", "11", "of"]
+    assert sheet.locator("button").first.is_disabled()
+    sheet.locator("button").last.click()
+    first = p.locator(".tile b").first
+    assert first.inner_text().startswith("12 ")
+    first.scroll_into_view_if_needed()
+    until(p, "document.querySelector('.tile canvas').dataset.drawn === ''")
+    for _ in range(3):  # to the last of 80, by 20; the page moves as it is filled
+        stances.locator("button").last.dispatch_event("click")
+    assert stances.locator("button").last.is_disabled()
+    assert p.locator(f"tr[data-stance='{2 * LONG - 1}']").count() == 1
+    assert p.locator(".events tbody tr").count() == 40
+    events.locator("button").last.dispatch_event("click")
+    assert p.locator(".events tbody td").nth(1).inner_text() == "event 40"
+    assert complaints == []
 
 
 def test_it_prints(page: tuple[Any, list[str]]):

@@ -168,10 +168,13 @@ class ReportCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand:
-    """Look at a run or a recording in the browser, step through it, edit a plan."""
+    """Climb on a page in the browser, or look there at runs and edit a plan."""
 
-    source: Annotated[str, tyro.conf.Positional, shown("RUN|RECORDING")]
-    """A run folder, whole or not; a recording, or a built-in demonstration by name."""
+    sources: Annotated[
+        tuple[str, ...], tyro.conf.Positional, shown("RUN|RECORDING", "a new climb")
+    ] = ()
+    """A run folder, whole or not, or several to lay side by side; a recording, or a
+    built-in demonstration by name. None: a page on which to choose and climb."""
     demo: Annotated[str | None, shown("RECORDING|NAME", "the run's own")] = None
     """The recording that is shown beside a run."""
     scene: Annotated[Path | None, shown("FILE")] = None
@@ -187,8 +190,10 @@ class ViewCommand:
         from clamber.show.live import open_view
 
         place: dict[str, Any] = {"host": self.host, "port": self.port}
+        source, *beside = self.sources or (None,)
         page = open_view(
-            self.source,
+            source,
+            beside=beside,
             demo=self.demo,
             scene=None if self.scene is None else clamber.load_scene(self.scene),
             **{k: v for k, v in place.items() if v is not None},

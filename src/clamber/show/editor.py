@@ -6,9 +6,8 @@ scale; it is planned again as ever.
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,10 @@ import numpy as np
 
 from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.steps import same_place
-from clamber.errors import ClamberError
 from clamber.execution.simulation import Rollout, simulate
 from clamber.execution.verdict import Verdict, judge
 from clamber.model.records import short_repr
+from clamber.model.scene import Box, Scene
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning import planner
 from clamber.planning.records import Plan, Progress
@@ -32,12 +31,34 @@ from clamber.run.folder import (
     save_sequence,
     save_verdict,
 )
-from clamber.show.page import Page, paragraphs
+from clamber.show.page import Page, Work, paragraphs
+from clamber.show.scene3d import ALIKE, GHOST, GHOST_OPACITY
 
 INSET = 0.01  # [m] a contact that is dragged stays so far inside its support
 FOLDER = "edited"  # in the run folder
 GIZMO = 0.22  # [m]
-NOTHING = "none"
+NOTHING, BOX = "none", "the box "  # what is moved
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Edits:
+    """What is changed of a plan, all of it at once: a step of undoing is another one.
+
+    Attributes:
+        moved: Support and place (3,) [m] of contacts, by the names of their intervals.
+        off: Surfaces that are not to be used.
+        boxes: Boxes that are elsewhere, or of another size, by name.
+    """
+
+    moved: Mapping[str, tuple[str, np.ndarray]] = field(default_factory=dict)
+    off: frozenset[str] = frozenset()
+    boxes: Mapping[str, Box] = field(default_factory=dict)
+
+    __repr__ = short_repr
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self.moved or self.off or self.boxes)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -93,21 +114,13 @@ def _on(c: Contact) -> str:
     return f"{c.surface} on {c.support}"
 
 
-def edited_sequence(
-    plan: Plan, moved: Mapping[str, np.ndarray], off: Collection[str]
-) -> ContactSequence:
-    """The sequence of a plan with contacts moved and surfaces left out.
-
-    Args:
-        plan: It.
-        moved: Places (3,) of contacts by the names of their intervals [m].
-        off: Surfaces that are not to be used.
-    """
+def edited_sequence(plan: Plan, edits: Edits) -> ContactSequence:
+    """The sequence of a plan with contacts moved and surfaces left out."""
     intervals, stances = intervals_of(plan), list(plan.sequence.stances)
-    for name, place in moved.items():
+    for name, (support, place) in edits.moved.items():
         x = intervals[name]
-        on = plan.world.supports[x.contact.support].nearest(place, INSET)
-        contact = replace(x.contact, position=on, fixed=True)
+        on = plan.world.supports[support].nearest(place, INSET)
+        contact = replace(x.contact, support=support, position=on, fixed=True)
         for i in range(x.first, x.last):
             kept = (
                 contact if c.surface == contact.surface else c
@@ -115,25 +128,26 @@ def edited_sequence(
             )
             stances[i] = replace(stances[i], contacts=tuple(kept))
     sequence = replace(plan.sequence, stances=tuple(stances))
-    return without_surfaces(sequence, off)
+    return without_surfaces(sequence, edits.off)
 
 
-def plan_edited(
-    plan: Plan,
-    moved: Mapping[str, np.ndarray],
-    off: Collection[str],
-    progress: Progress | None = None,
-) -> Plan:
-    """Plan again, with contacts moved and surfaces left out as in `edited_sequence`.
+def edited_scene(plan: Plan, edits: Edits) -> Scene:
+    """The scene of a plan with boxes moved; contacts on them go with them."""
+    scene = plan.world.scene
+    boxes = tuple(edits.boxes.get(b.name, b) for b in scene.boxes)
+    return replace(scene, boxes=boxes)
+
+
+def plan_edited(plan: Plan, edits: Edits, progress: Progress | None = None) -> Plan:
+    """Plan again, with the edits made.
 
     Raises:
         InputError: The scene does not fit what is left of the sequence.
     """
-    sequence, world = edited_sequence(plan, moved, off), plan.world
     return planner.plan(
-        sequence,
-        world.robot,
-        world.scene,
+        edited_sequence(plan, edits),
+        plan.world.robot,
+        edited_scene(plan, edits),
         options=plan.options,
         contacts="demonstrated",
         progress=progress,
@@ -163,7 +177,7 @@ def save_edited(
 
 
 class Editor:
-    """Contacts to drag, surfaces to switch off, and what becomes of the plan."""
+    """Contacts and boxes to move, surfaces to switch off, and what becomes of it."""
 
     def __init__(
         self,
@@ -183,11 +197,10 @@ class Editor:
         """
         self._folder, self._plan, self._replaced = folder, plan, replaced
         self._intervals = intervals_of(plan)
-        self._moved: dict[str, np.ndarray] = {}
-        self._off: frozenset[str] = frozenset()
+        self._edits, self._before = Edits(), list[Edits]()
         self._new: Plan | None = None
         self._done: tuple[Rollout, Verdict] | None = None
-        self._busy = threading.Lock()
+        self._came_of_it = ""
         gui = page.server.gui
         if plan.state is not None:
             text = "The rest of a climb is not edited: edit the plan of the whole one."
@@ -197,17 +210,23 @@ class Editor:
         surfaces = [
             s for s in plan.world.surfaces if any(s in x.surfaces for x in stances)
         ]
-        self._choice = gui.add_dropdown("move", (NOTHING, *self._intervals))
+        boxes = [f"{BOX}{b.name}" for b in plan.world.scene.boxes]
+        self._choice = gui.add_dropdown("move", (NOTHING, *self._intervals, *boxes))
+        supports = tuple(plan.world.supports)
+        self._onto = gui.add_dropdown("onto", supports, visible=False)
+        self._height = gui.add_number(
+            "height [m]", 0.3, min=0.01, step=0.005, visible=False
+        )
         self._use = {s: gui.add_checkbox(f"use {s}", True) for s in surfaces}
         self._buttons = {
             "Re-plan": self._plan_again,
             "Simulate": self._run_physics,
             "Save": self._save,
+            "Undo": self._undo,
             "Undo all": self._forget,
         }
         self._handles = {n: gui.add_button(n) for n in self._buttons}
-        self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._said = gui.add_html("")
+        self._work = Work(gui, self._tell)
         self._gizmo = page.server.scene.add_transform_controls(
             "/edit/contact",
             scale=GIZMO,
@@ -216,84 +235,156 @@ class Editor:
             depth_test=False,
             visible=False,
         )
+        self._box = page.server.scene.add_box(
+            "/edit/box", color=GHOST, opacity=GHOST_OPACITY, visible=False
+        )
         self._choice.on_update(lambda _: self._choose())
         self._gizmo.on_update(self._dragged)
-        for box in self._use.values():
-            box.on_update(lambda _: self._switched())
+        self._onto.on_update(lambda _: self._moved_onto())
+        self._height.on_update(lambda _: self._resized())
+        for surface, box in self._use.items():
+            box.on_update(lambda _, s=surface: self._switched(s))
         for name, job in self._buttons.items():
-            self._handles[name].on_click(lambda _, job=job: self._work(job))
-        self._enable()
-
-    def _choose(self) -> None:
-        """Put the gizmo on the contact that is chosen."""
-        name = str(self._choice.value)
-        self._gizmo.visible = name != NOTHING
-        if name != NOTHING:
-            x = self._intervals[name]
-            support = self._plan.world.supports[x.contact.support]
-            self._gizmo.wxyz = quat_from_matrix(support.rotation)
-            self._gizmo.position = self._moved.get(name, x.planned)
-
-    def _dragged(self, event: Any) -> None:
-        """Keep the contact on its support."""
-        name = str(self._choice.value)
-        if name == NOTHING:
-            return
-        support = self._plan.world.supports[self._intervals[name].contact.support]
-        place = support.nearest(np.array(self._gizmo.position), INSET)
-        self._moved[name] = place
-        if event.phase == "end":
-            self._gizmo.position = place
-            self._tell()
-
-    def _switched(self) -> None:
-        """Surfaces that are not to be used."""
-        self._off = frozenset(s for s, box in self._use.items() if not box.value)
+            self._handles[name].on_click(lambda _, job=job: self._do(job))
         self._tell()
 
-    def _tell(self, *more: str) -> None:
-        """What is edited, and what came of it."""
-        off = {n: p - self._intervals[n].planned for n, p in self._moved.items()}
-        said = [
-            f"{n}: moved by {1000 * np.linalg.norm(d):.0f} mm" for n, d in off.items()
-        ]
-        if self._off:
-            said.append(f"without {', '.join(sorted(self._off))}")
-        self._said.content = paragraphs([*said, *more])
-        self._enable()
+    # What is chosen, and where it is.
 
-    def _enable(self) -> None:
-        """The buttons of what can be done now."""
-        busy, new = self._busy.locked(), self._new
-        self._handles["Re-plan"].disabled = busy
-        self._handles["Simulate"].disabled = (
-            busy or new is None or new.trajectory is None
-        )
-        self._handles["Save"].disabled = busy or new is None
-        self._handles["Undo all"].disabled = busy or not (
-            self._moved or self._off or new
-        )
+    def _chosen(self) -> tuple[str, Box | None]:
+        """The name that is chosen; the box as it is by now, where it is one."""
+        name = str(self._choice.value)
+        if not name.startswith(BOX):
+            return name, None
+        own = name.removeprefix(BOX)
+        boxes = {b.name: b for b in edited_scene(self._plan, self._edits).boxes}
+        return own, boxes[own]
 
-    def _work(self, job: Callable[[], str]) -> None:
-        """Do one thing at a time; what goes wrong is said, not thrown."""
-        if not self._busy.acquire(blocking=False):
+    def _place(self, name: str) -> tuple[str, np.ndarray]:
+        """Support and place (3,) of a contact by now [m]."""
+        x = self._intervals[name]
+        return self._edits.moved.get(name, (x.contact.support, x.planned))
+
+    def _choose(self) -> None:
+        """Put the gizmo on what is chosen, and show what can be done with it."""
+        name, box = self._chosen()
+        contact = box is None and name != NOTHING
+        self._onto.visible, self._height.visible = contact, box is not None
+        self._gizmo.visible, self._box.visible = name != NOTHING, box is not None
+        if box is not None:
+            self._gizmo.wxyz = quat_from_matrix(box.rotation)
+            self._gizmo.position = box.top.position
+            self._height.value = round(float(box.size[2]), 3)
+            self._box.dimensions = tuple((box.size + ALIKE).tolist())
+            self._box.position, self._box.wxyz = box.position, self._gizmo.wxyz
+        elif contact:
+            support, place = self._place(name)
+            rotation = self._plan.world.supports[support].rotation
+            self._gizmo.wxyz = quat_from_matrix(rotation)
+            self._gizmo.position, self._onto.value = place, support
+
+    # Edits; what the page was only told is no edit.
+
+    def _edit(self, **changed: Any) -> None:
+        """One step, which can be undone."""
+        self._before.append(self._edits)
+        self._edits = replace(self._edits, **changed)
+        self._came_of_it = ""
+        self._tell()
+
+    def _put_contact(self, name: str, support: str, place: np.ndarray) -> None:
+        """On its support, as near as that can be."""
+        on = self._plan.world.supports[support].nearest(place, INSET)
+        self._edit(moved={**self._edits.moved, name: (support, on)})
+        self._choose()
+
+    def _dragged(self, event: Any) -> None:
+        """A contact stays on its support, a box on the ground."""
+        name, box = self._chosen()
+        if event.phase != "end" or name == NOTHING:
             return
-        self._enable()
-        try:
-            said = job()
-        except (ClamberError, OSError) as e:
-            said = str(e)
-        self._busy.release()
-        self._progress.visible = False
-        self._tell(said)
+        place = np.array(self._gizmo.position)
+        if box is None:
+            self._put_contact(name, self._place(name)[0], place)
+        else:
+            at = box.position + (place - box.top.position) * [1.0, 1.0, 0.0]
+            self._put_box(replace(box, position=at))
 
-    def _report(self, stage: str, share: float, note: str) -> None:
-        self._progress.visible = True
-        self._progress.value = 100.0 * min(max(share, 0.0), 1.0)
-        self._said.content = paragraphs([f"{stage}: {note}" if note else stage])
+    def _moved_onto(self) -> None:
+        """A contact goes to the nearest place of another support."""
+        name, box = self._chosen()
+        support = str(self._onto.value)
+        if box is not None or name == NOTHING:
+            return
+        if support != self._place(name)[0]:
+            self._put_contact(name, support, self._place(name)[1])
+
+    def _resized(self) -> None:
+        """A box of another height stands where it stood."""
+        _, box = self._chosen()
+        if box is None or abs(self._height.value - box.size[2]) < ALIKE:
+            return
+        size = np.array([*box.size[:2], float(self._height.value)])
+        up = (size[2] - box.size[2]) / 2 * box.rotation[:, 2]
+        self._put_box(replace(box, size=size, position=box.position + up))
+
+    def _put_box(self, box: Box) -> None:
+        self._edit(boxes={**self._edits.boxes, box.name: box})
+        self._choose()
+
+    def _switched(self, surface: str) -> None:
+        """A surface is to be used, or not."""
+        off = self._edits.off - {surface}
+        if not self._use[surface].value:
+            off |= {surface}
+        if off != self._edits.off:
+            self._edit(off=off)
+
+    def _undo(self) -> str:
+        """The last edit."""
+        if self._before:
+            self._return_to(self._before.pop())
+        return ""
+
+    def _return_to(self, edits: Edits) -> None:
+        self._edits = edits
+        for surface, box in self._use.items():
+            box.value = surface not in edits.off
+        self._choose()
+
+    # What is said and done.
+
+    def _tell(self) -> None:
+        """What is edited, what came of it, and what can be done now."""
+        said = []
+        for name, (support, place) in self._edits.moved.items():
+            x = self._intervals[name]
+            off = 1000 * np.linalg.norm(place - x.planned)
+            onto = "" if support == x.contact.support else f" onto {support}"
+            said.append(f"{name}: moved by {off:.0f} mm{onto}")
+        was = {b.name: b for b in self._plan.world.scene.boxes}
+        for name, box in self._edits.boxes.items():
+            off = 1000 * np.linalg.norm((box.position - was[name].position)[:2])
+            said.append(f"{name}: {box.size[2]:.3f} m high, moved by {off:.0f} mm")
+        if self._edits.off:
+            said.append(f"without {', '.join(sorted(self._edits.off))}")
+        self._work.say(*said, self._came_of_it)
+        busy, new = self._work.busy, self._new
+        can = {
+            "Re-plan": True,
+            "Simulate": new is not None and new.trajectory is not None,
+            "Save": new is not None,
+            "Undo": bool(self._before),
+            "Undo all": bool(self._edits or new),
+        }
+        for name, possible in can.items():
+            self._handles[name].disabled = busy or not possible
+
+    def _do(self, job: Callable[[], str]) -> None:
+        self._came_of_it = self._work.do(job)
+        self._tell()
 
     def _plan_again(self) -> str:
-        self._new = plan = plan_edited(self._plan, self._moved, self._off, self._report)
+        self._new = plan = plan_edited(self._plan, self._edits, self._work.report)
         self._done = None
         self._replaced(plan, None)
         if plan.complete:
@@ -302,7 +393,7 @@ class Editor:
 
     def _run_physics(self) -> str:
         assert self._new is not None
-        rollout = simulate(self._new, progress=self._report)
+        rollout = simulate(self._new, progress=self._work.report)
         verdict = judge(self._new, rollout)
         self._done = (rollout, verdict)
         self._replaced(self._new, rollout)
@@ -316,10 +407,8 @@ class Editor:
         return f"Saved as {save_edited(self._folder, self._new, self._done)}"
 
     def _forget(self) -> str:
-        self._moved, self._off = {}, frozenset()
-        self._new = self._done = None
+        self._before, self._new, self._done = [], None, None
         self._choice.value = NOTHING
-        for box in self._use.values():
-            box.value = True
+        self._return_to(Edits())
         self._replaced(None, None)
         return ""

@@ -6,28 +6,36 @@ What is only read (plots, tables, criteria) is in the report, which the page han
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clamber.contact.contact import ContactSequence
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.arguments import checks_types
-from clamber.model.kinematics import Kinematics
 from clamber.model.terrain import SceneLike
 from clamber.planning.records import Plan
-from clamber.recording.built_in import BUILT_IN, source_of
+from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import PLAN, SEQUENCE, fallback_note, load_sequence
+from clamber.show.chart import Chart
 from clamber.show.editor import Editor
-from clamber.show.page import Page
-from clamber.show.renderer import seen_points
+from clamber.show.handout import Handout
+from clamber.show.page import Page, paragraphs, rows_of
 from clamber.show.sample import Run, read_run, thinned
-from clamber.show.scene3d import Figure, Stage
-from clamber.show.skeleton import Skeleton, beside, paired_times, skeleton_of
+from clamber.show.scene3d import BEFORE_EDITING, Figure, Stage
+from clamber.show.skeleton import (
+    Skeleton,
+    corners,
+    paired_times,
+    recording_named,
+    skeleton_of,
+    to_the_right,
+)
+from clamber.show.start import StartPage
 
 FOVY = 45.0  # [deg] of what has no model
 PERSON_LAYER = "recording"
@@ -38,24 +46,28 @@ LAYERS = {  # name in the page: shown at first
     "forces": True,
     "balance": True,
     "way of the limb": True,
+    BEFORE_EDITING: False,
     PERSON_LAYER: False,
 }
 
 
 @checks_types
 def open_view(
-    source: str | Path,
+    source: str | Path | None = None,
     *,
+    beside: Sequence[str | Path] = (),
     demo: str | Path | None = None,
     scene: SceneLike | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Page:
-    """Serve a run or a recording as a page in the browser.
+    """Serve a run or a recording, or the way to a first one, as a page in the browser.
 
     Args:
-        source: A run folder, whole or not; or a recording, a `recording.yaml`, or a
-            built-in demonstration by name.
+        source: A run folder, whole or not; a recording, a `recording.yaml`, or a
+            built-in demonstration by name. None: a page on which to choose recording,
+            robot and scene, and to climb.
+        beside: Run folders that are shown to the right of it.
         demo: The recording that is shown beside a run; by default the one that the run
             names as its source, where that is found.
         scene: Of a recording that has none.
@@ -72,113 +84,191 @@ def open_view(
     """
     if importlib.util.find_spec("viser") is None:
         raise MissingDependency("viser", "view")
-    path = Path(source)
-    if str(source) in BUILT_IN or not path.is_dir():
+    if source is None:
         if demo is not None:
-            raise InputError("a run folder: --demo goes with one", source=source)
-        recorded, missing = load_demo(source, scene=scene), []
-        sequence = None
-        try:
-            sequence = detect_contacts(recorded)
-        except ClamberError as e:
-            missing.append(f"no contacts: {e}")
-        page = Page(host, port, recorded.source, missing, recorded.notes)
-        _show_recording(page, skeleton_of(recorded, sequence))
+            raise InputError("a run folder: --demo goes with one", source=demo)
+        page = Page(host, port)
+
+        def opened(folder: Path) -> None:
+            run = read_run(folder)
+            _show_run(page, run, person=_person_of(run))
+
+        StartPage(page, opened)
         return page
-    return _open_run(path, demo, scene, host, port)
-
-
-def _open_run(
-    folder: Path, demo: str | Path | None, scene: SceneLike | None, host: str, port: int
-) -> Page:
-    """The page of a run folder: of its motion, else of its recording, else of words."""
-    run = read_run(folder)
+    path = Path(source)
+    if str(source) not in BUILT_IN and path.is_dir():
+        runs = [read_run(folder) for folder in (path, *map(Path, beside))]
+        for run in runs[1:]:
+            if run.plan is None:
+                raise InputError(f"a run folder with a whole {PLAN}", source=run.folder)
+        person = _person_of(runs[0], demo, scene)
+        page = Page(host, port)
+        _show_run(page, runs[0], runs[1:], person)
+        return page
+    if demo is not None or beside:
+        raise InputError("a run folder: others, and --demo, go with one", source=source)
+    recorded, missing = load_demo(source, scene=scene), []
     sequence = None
-    if run.has(SEQUENCE) or not run.written:
-        sequence = run.attempt(lambda: load_sequence(folder))
-    if not (run.written or run.verdict or run.execution or sequence is not None):
-        raise InputError(
-            f"a run folder with {PLAN} or {SEQUENCE} ({'; '.join(run.missing)})",
-            source=folder,
-        )
-    named, skeleton = _named_recording(sequence, run) if demo is None else demo, None
-    if named is not None:
-        recorded = run.attempt(lambda: load_demo(named, scene=scene))
-        if recorded is not None:
-            if sequence is None or sequence.subject is None:
-                sequence = run.attempt(lambda: detect_contacts(recorded))
-            skeleton = skeleton_of(recorded, sequence)
-    notes = (fallback_note(run.written), run.execution.get("stopped", ""))
-    page = Page(host, port, folder.resolve().name, run.missing, notes)
-    if run.plan is not None:
-        _RunPage(page, run, run.plan, skeleton)
-    elif skeleton is not None:
-        _show_recording(page, skeleton)
-    if run.written or run.verdict:
-        page.add_report(folder)
+    try:
+        sequence = detect_contacts(recorded)
+    except ClamberError as e:
+        missing.append(f"no contacts: {e}")
+    page = Page(host, port)
+    page.begin(recorded.source, missing, recorded.notes)
+    _show_recording(page, skeleton_of(recorded, sequence))
     return page
 
 
-def _named_recording(sequence: ContactSequence | None, run: Run) -> str | None:
-    """The recording that a run names as its source, where it can be found."""
+def _person_of(
+    run: Run, demo: str | Path | None = None, scene: SceneLike | None = None
+) -> Skeleton | None:
+    """The recording that is shown beside a run, where it is found.
+
+    Raises:
+        InputError: There is nothing to show of the run.
+    """
+    sequence = None
+    if run.has(SEQUENCE) or not run.written:
+        sequence = run.attempt(lambda: load_sequence(run.folder))
+    if not (run.written or run.verdict or run.execution or sequence is not None):
+        raise InputError(
+            f"a run folder with {PLAN} or {SEQUENCE} ({'; '.join(run.missing)})",
+            source=run.folder,
+        )
     source = run.written.get("sequence", {}).get("source", "")
     if sequence is not None:
         source = sequence.source
-    for name in BUILT_IN:
-        if source == source_of(name):
-            return name
-    return source if source and Path(source).is_file() else None
+    named = recording_named(source) if demo is None else demo
+    if named is None:
+        return None
+    recorded = run.attempt(lambda: load_demo(named, scene=scene))
+    if recorded is None:
+        return None
+    if sequence is None or sequence.subject is None:
+        sequence = run.attempt(lambda: detect_contacts(recorded))
+    return skeleton_of(recorded, sequence)
+
+
+def _show_run(
+    page: Page, run: Run, others: Sequence[Run] = (), person: Skeleton | None = None
+) -> None:
+    """The page of a run folder: of its motion, else of its recording, else of words."""
+    notes = (fallback_note(run.written), run.execution.get("stopped", ""))
+    page.begin(run.folder.resolve().name, run.missing, notes)
+    if run.verdict:
+        _add_verdict(page, run.verdict)
+    if run.plan is not None:
+        _RunPage(page, run, run.plan, others, person)
+        return
+    if person is not None:
+        _show_recording(page, person)
+    if run.written or run.verdict:
+        Handout(page, run.folder, None)
 
 
 def _show_recording(page: Page, skeleton: Skeleton) -> None:
     """A recording alone."""
+    page.timeline()
     figure, demo = Figure(page.server, skeleton, np.zeros(3)), skeleton.demo
     page.look(figure.seen(), float(demo.scene.start[2]), FOVY)
     page.watch(figure.show)
     page.span(float(demo.t[0]), float(demo.t[-1]), skeleton.changes())
 
 
+def _add_verdict(page: Page, verdict: Mapping[str, Any]) -> None:
+    """Whether the robot made it, and each criterion, from fields of `verdict.json`."""
+    reached, gui = bool(verdict.get("reached")), page.server.gui
+    colour = "#16a34a" if reached else "#dc2626"
+    said = "reached the goal" if reached else "did not make it"
+    gui.add_html(
+        f'<p style="margin: 4px 12px; font-weight: 600; color: {colour}">{said}</p>'
+    )
+    rows = (
+        (
+            name if c["ok"] else f"{name}: NOT MET",
+            f"{c['value']:.4g} / {c['limit']:.4g}",
+        )
+        for name, c in verdict.get("criteria", {}).items()
+    )
+    with gui.add_folder("Verdict: value / limit", expand_by_default=False):
+        gui.add_html(rows_of(rows))
+
+
 class _RunPage:
     """What the page of a run shows at present: it, or what editing made of it."""
 
-    def __init__(self, page: Page, run: Run, plan: Plan, skeleton: Skeleton | None):
+    def __init__(
+        self,
+        page: Page,
+        run: Run,
+        plan: Plan,
+        others: Sequence[Run],
+        skeleton: Skeleton | None,
+    ):
+        page.timeline()
         self._page, self._plan, self._rollout = page, plan, run.rollout
         self._layers = dict(LAYERS)
-        self._count = 0
-        self._figure = None
-        self._put(plan, run.rollout)
-        world = self._stage.motion.world
-        self._points = seen_points(Kinematics(world), self._stage.motion.q)
+        self._stage = self._first = Stage(page.server, plan, run.rollout, "/run")
+        self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
+        self._count, self._figure, gui = 0, None, page.server.gui
+        scene = self._stage.motion.world.scene
+        self._points = self._stage.seen()
+        self._others: list[Stage] = []
+        for i, other in enumerate(others):
+            assert other.plan is not None
+            stage = Stage(page.server, other.plan, other.rollout, f"/other{i}")
+            there = stage.motion.world.scene
+            offset = to_the_right(scene, self._points, there, stage.seen())
+            stage.root.position = offset
+            seen = np.concatenate([stage.seen(), corners(there)]) + offset
+            self._points = np.concatenate([self._points, seen])
+            self._others.append(stage)
         if skeleton is not None:
             person = thinned(skeleton.position, 60).reshape(-1, 3)
-            offset = beside(world.scene, self._points, skeleton.demo.scene, person)
+            offset = to_the_right(scene, self._points, skeleton.demo.scene, person)
             self._figure = Figure(page.server, skeleton, offset)
         self._look()
+        page.follow(lambda t: self._stage.base(t))
         with page.layers:
-            for name in LAYERS:
-                if name != PERSON_LAYER or skeleton is not None:
-                    self._toggle(name)
-        with page.server.gui.add_folder("Edit", expand_by_default=False):
+            hidden = set() if skeleton is not None else {PERSON_LAYER}
+            for name in (n for n in LAYERS if n not in hidden):
+                self._toggle(name)
+        self._chart = Chart(page, lambda: self._stage.motion)
+        with gui.add_folder("Edit", expand_by_default=False):
             Editor(page, run.folder, plan, self.replace)
+        with gui.add_folder("Take away", expand_by_default=False):
+            Handout(page, run.folder, lambda: (self._plan_shown, self._rollout_shown))
+        self._plan_shown, self._rollout_shown = plan, run.rollout
+        if others:
+            names = ", ".join(str(x.folder) for x in (run, *others))
+            gui.add_html(paragraphs([f"From the robot's left to its right: {names}."]))
         page.watch(self._show)
-        page.span(0.0, self._stage.duration, self._stage.events())
+        page.watch_slowly(self._chart.show)
+        self._span()
 
     def replace(self, plan: Plan | None, rollout: Rollout | None) -> None:
         """Show another plan, and what physics made of it; None: the run as it was."""
         with self._page.clock.lock:
+            before = self._stage
             if plan is None:
-                plan, rollout = self._plan, self._rollout
-            self._put(plan, rollout)
-            self._page.span(0.0, self._stage.duration, self._stage.events())
+                plan, rollout, self._stage = self._plan, self._rollout, self._first
+            else:
+                self._count += 1
+                name = f"/run{self._count}"
+                server = self._page.server
+                self._stage = Stage(server, plan, rollout, name, before=self._first)
+            self._plan_shown, self._rollout_shown = plan, rollout
+            self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
+            self._first.root.visible = self._stage is self._first
+            if before is not self._first:
+                before.root.remove()
+            self._span()
+            self._chart.renew()
 
-    def _put(self, plan: Plan, rollout: Rollout | None) -> None:
-        """Make a stage for it, in place of the one before."""
-        before = self._stage if self._count else None
-        self._count += 1
-        self._stage = Stage(self._page.server, plan, rollout, f"/run{self._count}")
-        self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
-        if before is not None:
-            before.root.remove()
+    def _span(self) -> None:
+        """As long as the longest of what is shown; the contacts of the first."""
+        end = max(x.duration for x in (self._stage, *self._others))
+        self._page.span(0.0, end, self._stage.events())
 
     def _toggle(self, name: str) -> None:
         """A checkbox for one of the layers."""
@@ -205,4 +295,6 @@ class _RunPage:
             self._figure.root.visible = self._layers[PERSON_LAYER]
             if self._layers[PERSON_LAYER]:
                 self._figure.show(float(np.interp(t, *self._paired)))
+        for other in self._others:
+            other.show(t, self._layers)
         return self._stage.show(t, self._layers)

@@ -11,18 +11,16 @@ import html
 import io
 import math
 import socket
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 
-from clamber.errors import InputError
+from clamber.errors import ClamberError, InputError
 from clamber.show.renderer import PRESETS, Preset, View, frame_view
-from clamber.show.report import write_report
 
 FRAMES_A_SECOND = 30
 PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
@@ -31,6 +29,7 @@ SLIDER_STEP = 0.01  # [s]
 STEP = 0.02  # [s] events nearer than this are where one is
 PANEL_WIDTH, ASPECT = 360, 1.2  # [px]; of the picture beside it
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
+UPRIGHT, ABOVE_SHEET = 0.65, 0.4  # a phone's width to height; share above its panel
 PLAY, PAUSE, BACK, ON = "play", "pause", "< contact", "contact >"
 SECTIONS, CELLS = (150, 157, 166), (176, 183, 192)  # of the ground, light and dark
 
@@ -89,51 +88,69 @@ class Clock:
 class Page:
     """A server, its panel, cameras and clock; what is shown is told of each time."""
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        title: str,
-        missing: list[str],
-        notes: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, host: str, port: int) -> None:
         """Start serving; nothing is shown yet.
 
         Args:
             host: To listen on.
             port: From which on viser takes a free one.
-            title: Of the panel.
-            missing: A sentence for each thing that cannot be shown.
-            notes: What else there is to say.
 
         Raises:
             InputError: There is no such address.
         """
         import viser
 
-        self.host, self.wanted, self.missing = host, port, missing
+        self.host, self.wanted = host, port
+        self.missing: list[str] = []
         check_address(host, port)
         with _silent():
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.port = self.server.get_port()
         self.clock = Clock(self._tell)
         self._watchers: list[Callable[[float], str]] = []
-        self._views: dict[Preset, View] = {}
+        self._slow_watchers: list[Callable[[float], None]] = []
+        self._seen: tuple[np.ndarray, float, float] | None = None
+        self._where: Callable[[float], np.ndarray] | None = None
+        self._was = np.zeros(3)
         self._panel_next = 0.0
         self._stopped = threading.Event()
+        self.server.on_client_connect(self._welcome)
+        self._player = threading.Thread(target=self._play, daemon=True)
+        self._player.start()
+
+    def begin(
+        self, title: str, missing: Sequence[str] = (), notes: Sequence[str] = ()
+    ) -> None:
+        """Have a new page, with ground and lights, in place of what was there.
+
+        Args:
+            title: Of the panel.
+            missing: A sentence for each thing that cannot be shown.
+            notes: What else there is to say.
+        """
         gui = self.server.gui
+        with self.clock.lock:
+            self.clock.playing, self.clock.t = False, 0.0
+            self._watchers, self._slow_watchers, self._where = [], [], None
+            gui.reset()
+            self.server.scene.reset()
+        self.missing = list(missing)
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label(title)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
         if missing or any(notes):
             gui.add_html(paragraphs((*missing, *(n for n in notes if n))))
+        self._surroundings()
+
+    def timeline(self) -> None:
+        """Add what plays, and a folder of what is shown: `layers`."""
+        gui = self.server.gui
         self._now = gui.add_html("")
-        self._timeline()
+        self._controls()
         with gui.add_folder("Show", expand_by_default=False) as self.layers:
-            self._surroundings()
-        self._player = threading.Thread(target=self._play, daemon=True)
-        self._player.start()
+            self._cameras()
+        self._keys()
 
     @property
     def url(self) -> str:
@@ -161,33 +178,48 @@ class Page:
         """Have it show each new time [s], and return HTML of what there is to say."""
         self._watchers.append(show)
 
+    def watch_slowly(self, show: Callable[[float], None]) -> None:
+        """Have it told of times [s] as often as the panel is."""
+        self._slow_watchers.append(show)
+
     def look(self, points: np.ndarray, yaw: float, fovy: float) -> None:
         """Have cameras take in points (n, 3) [m]: of a new browser, and the presets."""
-        self._views = {
-            name: frame_view(points, ASPECT, yaw=yaw, fovy=fovy, camera=name)
-            for name in PRESETS
-        }
-        first, camera = self._views["corner"], self.server.initial_camera
+        self._seen = (points, yaw, fovy)
+        first = frame_view(points, ASPECT, yaw=yaw, fovy=fovy)
+        camera = self.server.initial_camera
         camera.position, camera.look_at = eye_of(first), first.lookat
-        camera.up, camera.fov = (0.0, 0.0, 1.0), math.radians(first.fovy)
+        camera.up, camera.fov = (0.0, 0.0, 1.0), math.radians(fovy)
+
+    def aim(self, client: Any, name: Preset = "corner") -> None:
+        """Have a browser look from a preset; a phone above the sheet of its panel."""
+        if self._seen is None:
+            return
+        points, yaw, fovy = self._seen
+        half, aspect = math.tan(math.radians(fovy) / 2), client.camera.aspect
+        share = ABOVE_SHEET if aspect < UPRIGHT else 1.0
+        view = frame_view(
+            points,
+            aspect / share,
+            yaw=yaw,
+            fovy=2 * math.degrees(math.atan(share * half)),
+            camera=name,
+        )
+        reach = float(np.linalg.norm(eye_of(view) - view.lookat))
+        down = (1 - share) * half * reach * view.axes[1]
+        with client.atomic():
+            client.camera.position = eye_of(view) - down
+            client.camera.look_at = view.lookat - down
+
+    def follow(self, where: Callable[[float], np.ndarray]) -> None:
+        """Tell where the robot is, (3,) at a time [s], for cameras that go with it."""
+        self._where = where
 
     def span(self, begin: float, end: float, events: Sequence[float]) -> None:
         """What there is to play [s], and the times to step through."""
         self._slider.min, self._slider.max = begin, max(end, begin + SLIDER_STEP)
         self.clock.span(begin, end, events)
 
-    def add_report(self, folder: Path) -> None:
-        """A button that hands out the report of a run."""
-        button = self.server.gui.add_button("Report: plots, tables, criteria")
-
-        @button.on_click
-        def _(event: Any) -> None:
-            with tempfile.TemporaryDirectory() as there:
-                file = write_report(folder, out=Path(there) / "report.html").file
-                name = f"{folder.resolve().name}.html"
-                event.client.send_file_download(name, file.read_bytes())
-
-    def _timeline(self) -> None:
+    def _controls(self) -> None:
         """Slider, buttons, speed and keys."""
         gui, clock = self.server.gui, self.clock
         self._slider = gui.add_slider("time [s]", 0.0, 1.0, SLIDER_STEP, 0.0)
@@ -213,17 +245,33 @@ class Page:
         def _(_: Any) -> None:
             clock.speed = float(speed.value.removesuffix("x"))
 
-        for key, label, act in (
-            ("space", "Play or pause", clock.toggle),
-            ("pagedown", "Next contact", lambda: clock.step(1)),
-            ("pageup", "Previous contact", lambda: clock.step(-1)),
-        ):
-            command = gui.add_command(label, hotkey=cast(Any, key))
-            command.on_trigger(lambda _, act=act: act())
+    def _keys(self) -> None:
+        """Keys, which the browser's list of commands has too, and a table of them."""
+        clock, gui = self.clock, self.server.gui
+
+        def follow(_: Any) -> None:
+            self._follow.value = not self._follow.value
+
+        keys: list[tuple[str, str, Callable[[Any], None]]] = [
+            ("Space", "Play or pause", lambda _: clock.toggle()),
+            ("PageDown", "Next contact", lambda _: clock.step(1)),
+            ("PageUp", "Previous contact", lambda _: clock.step(-1)),
+            ("Home", "To the beginning", lambda _: clock.go(clock.begin)),
+            ("End", "To the end", lambda _: clock.go(clock.end)),
+            ("F", "Follow the robot, or not", follow),
+        ]
+        for i, name in enumerate(PRESETS, 1):
+            act = partial(lambda event, name: self.aim(event.client, name), name=name)
+            keys.append((str(i), f"Camera: {name}", act))
+        for key, label, act in keys:
+            hotkey = cast(Any, key if len(key) == 1 else key.lower())
+            gui.add_command(label, hotkey=hotkey).on_trigger(act)
+        with gui.add_folder("Keys", expand_by_default=False):
+            gui.add_html(rows_of((key, label) for key, label, _ in keys))
 
     def _surroundings(self) -> None:
-        """Lights, ground, cameras and theme."""
-        gui, scene = self.server.gui, self.server.scene
+        """Lights and ground."""
+        scene = self.server.scene
         scene.configure_environment_map(None)
         scene.configure_default_lights(False)
         scene.add_light_hemisphere(
@@ -232,7 +280,7 @@ class Page:
             ground_color=(170, 165, 160),
             intensity=2.2,
         )
-        sun = scene.add_light_directional(
+        self._sun = scene.add_light_directional(
             "/lights/sun", intensity=2.2, position=(-1.5, -2.5, 4.0)
         )
         scene.add_grid(
@@ -246,31 +294,51 @@ class Page:
             fade_distance=9.0,
             shadow_opacity=0.25,
         )
+
+    def _cameras(self) -> None:
+        """From where, with the robot or not, and shadows."""
+        gui = self.server.gui
         cameras = gui.add_button_group("camera", tuple(PRESETS))
+        self._follow = gui.add_checkbox("follow the robot", False)
         shadows = gui.add_checkbox("shadows", False)
 
         @cameras.on_click
         def _(event: Any) -> None:
-            view = self._views.get(cast(Preset, cameras.value))
-            if event.client is not None and view is not None:
-                with event.client.atomic():
-                    event.client.camera.position = eye_of(view)
-                    event.client.camera.look_at = view.lookat
+            if event.client is not None:
+                self.aim(event.client, cast(Preset, cameras.value))
 
         @shadows.on_update
         def _(_: Any) -> None:
-            sun.cast_shadow = shadows.value
+            self._sun.cast_shadow = shadows.value
+
+    def _welcome(self, client: Any) -> None:
+        """A phone's camera is not that of a screen."""
+        if client.camera.aspect < UPRIGHT:
+            self.aim(client)
+
+    def _carry(self, t: float) -> None:
+        """Have the cameras go the way of the robot."""
+        if self._where is None:
+            return
+        at = self._where(t)
+        way, self._was = at - self._was, at
+        if self._follow.value and np.any(way):
+            for client in self.server.get_clients().values():
+                client.camera.position = client.camera.position + way
 
     def _tell(self, t: float) -> None:
         """The scene follows each step of the clock, the panel some while it plays."""
         now = time.perf_counter()
         with self.server.atomic():
             said = [show(t) for show in self._watchers]
+            self._carry(t)
             self._buttons.options = (BACK, PAUSE if self.clock.playing else PLAY, ON)
             if not self.clock.playing or now >= self._panel_next:
                 self._panel_next = now + PANEL_SECONDS
                 self._slider.value = round(t, 2)
                 self._now.content = "".join(said)
+                for show in self._slow_watchers:
+                    show(t)
 
     def _play(self) -> None:
         """Let time pass, in steps of a frame, while somebody looks."""
@@ -280,6 +348,55 @@ class Page:
             if self.server.get_clients():
                 self.clock.advance(min(now - last, 0.25))
             last = now
+
+
+class Work:
+    """One thing at a time that takes a while: how far it is, and what came of it."""
+
+    def __init__(self, gui: Any, changed: Callable[[], None] = lambda: None) -> None:
+        """Add a bar and a line to the panel.
+
+        Args:
+            gui: Of the page.
+            changed: Called when it begins and when it has ended.
+        """
+        self._busy, self._changed = threading.Lock(), changed
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._said = gui.add_html("")
+
+    @property
+    def busy(self) -> bool:
+        """Whether something is being done."""
+        return self._busy.locked()
+
+    def do(self, job: Callable[[], str]) -> str:
+        """Do it, unless something is being done; what goes wrong is said, not thrown.
+
+        Args:
+            job: Returns what is to be said in the end.
+        """
+        if not self._busy.acquire(blocking=False):
+            return ""
+        self._changed()
+        try:
+            said = job()
+        except (ClamberError, OSError) as e:
+            said = str(e)
+        self._busy.release()
+        self._bar.visible = False
+        self.say(said)
+        self._changed()
+        return said
+
+    def report(self, stage: str, share: float, note: str) -> None:
+        """How far it is: a stage, its share, and what is at hand."""
+        self._bar.visible = True
+        self._bar.value = 100.0 * min(max(share, 0.0), 1.0)
+        self.say(f"{stage}: {note}" if note else stage)
+
+    def say(self, *texts: str) -> None:
+        """Have these lines there, in place of those before."""
+        self._said.content = paragraphs([x for x in texts if x])
 
 
 def check_address(host: str, port: int) -> None:
@@ -311,6 +428,16 @@ def paragraphs(texts: Sequence[str]) -> str:
     """Texts, which may come from a run folder, as HTML that is no markup of theirs."""
     lines = "".join(f'<p style="margin: 4px 0">{html.escape(x)}</p>' for x in texts)
     return f'<div style="font-size: 13px; padding: 0 12px">{lines}</div>'
+
+
+def rows_of(pairs: Iterable[tuple[str, str]]) -> str:
+    """A table of two columns as HTML; the texts are no markup."""
+    cell = '<td style="padding: 1px 12px 1px 0; vertical-align: top">'
+    rows = "".join(
+        f"<tr>{cell}{html.escape(a)}</td>{cell}{html.escape(b)}</td></tr>"
+        for a, b in pairs
+    )
+    return f'<table style="font-size: 13px; margin: 4px 12px">{rows}</table>'
 
 
 def eye_of(view: View) -> np.ndarray:

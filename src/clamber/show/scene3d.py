@@ -22,6 +22,7 @@ from clamber.planning.records import Plan
 from clamber.show.marks import FORCE_LENGTH, PHASE_COLOURS
 from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.page import paragraphs
+from clamber.show.renderer import seen_points
 from clamber.show.sample import (
     force_by_contact,
     keyframe_times,
@@ -37,7 +38,9 @@ from clamber.show.skeleton import Skeleton
 # One level of meshes, at rest and in motion, that a processor draws in time too.
 TRIANGLES, DEVIATION = 15_000, 0.0008  # [m] that faces may be off a round geom
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
-GHOST, GHOST_OPACITY, SEE_THROUGH = (59, 130, 246), 0.3, 0.45
+GHOST, BEFORE, GHOST_OPACITY = (59, 130, 246), (217, 70, 239), 0.3
+SEE_THROUGH = 0.45
+BEFORE_EDITING = "before editing"  # the layer of the plan as it was
 BALANCE, PUSH, WAY = (37, 99, 235), (162, 28, 175), (124, 58, 237)
 PERSON, PERSON_BOX = (144, 172, 201), (203, 188, 165)
 DISC, LIFT, LINE = 0.055, 0.004, 0.006  # [m] radius, height, width
@@ -101,6 +104,29 @@ def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (off > ALIKE) | (2 * np.arccos(cosine) > ALIKE_TURNED)
 
 
+class Ghost:
+    """A robot as it would be elsewhere in time: pale, where it is not as it is."""
+
+    def __init__(
+        self,
+        scene: Any,
+        name: str,
+        meshes: Sequence[Mesh],
+        colour: tuple[int, int, int],
+    ):
+        """Send it, unseen."""
+        look: Mapping[str, Any] = {"color": colour, "opacity": GHOST_OPACITY}
+        self._bodies = Bodies(scene, name, meshes, **look)
+        self._bodies.root.visible = False
+
+    def show(self, poses: np.ndarray | None, robot: np.ndarray) -> None:
+        """Put it at poses (nb, 7), beside those of the robot; None: hide it."""
+        self._bodies.root.visible = poses is not None
+        if poses is not None:
+            self._bodies.pose(poses)
+            self._bodies.show(apart(poses, robot))
+
+
 class Discs:
     """A disc at each of some contacts."""
 
@@ -127,7 +153,15 @@ class Discs:
 class Stage:
     """The scene of a run, and what changes in it."""
 
-    def __init__(self, server: Any, plan: Plan, rollout: Rollout | None, root: str):
+    def __init__(
+        self,
+        server: Any,
+        plan: Plan,
+        rollout: Rollout | None,
+        root: str,
+        *,
+        before: Stage | None = None,
+    ):
         """Send all that does not change.
 
         Args:
@@ -135,10 +169,11 @@ class Stage:
             plan: What was to be done.
             rollout: What physics made of it, or None.
             root: Name of the node that all hang in.
+            before: Whose robot is shown too on request, as it is at the same time.
         """
         self.motion = m = sample_motion(plan, rollout, {})
         self.reached = keyframe_times(plan, rollout)
-        self.changes = [str(c.step) for c in plan.changes]
+        self.changes = [f"stance {c.step.stance}: {c.step}" for c in plan.changes]
         as_planned = rollout is None or rollout.followed is None
         trajectory = plan.trajectory if as_planned else None
         self._swings = [] if trajectory is None else swings_of(m, trajectory)
@@ -153,10 +188,12 @@ class Stage:
         self._meshes = [x for x in meshes if x.body != 0]
         Bodies(add, f"{root}/scene", [x for x in meshes if x.body == 0])
         self._robot = Bodies(add, f"{root}/robot", self._meshes)
-        ghost: Mapping[str, Any] = {"color": GHOST, "opacity": GHOST_OPACITY}
-        self._ghost = None
+        self._ghost = self._old = None
+        self._before = before
         if m.reference is not None:
-            self._ghost = Bodies(add, f"{root}/ghost", self._meshes, **ghost)
+            self._ghost = Ghost(add, f"{root}/ghost", self._meshes, GHOST)
+        if before is not None:
+            self._old = Ghost(add, f"{root}/before", self._meshes, BEFORE)
         self._discs = Discs(add, f"{root}/contacts", len(m.world.surfaces))
         none = np.zeros((1, 2, 3))
         self._arrows = add.add_arrows(
@@ -192,9 +229,17 @@ class Stage:
 
     def show(self, t: float, layers: Mapping[str, bool]) -> str:
         """Send what differs from the last time; figures of this one, as HTML."""
-        m, kin, row = self.motion, self._kin, row_at(self.motion.time, t)
-        kin.update(posture_at(m, m.q, t))
-        poses = body_poses(kin.data, self._meshes)
+        m, row = self.motion, row_at(self.motion.time, t)
+        ghost = old = None
+        if self._old is not None and layers[BEFORE_EDITING]:
+            assert self._before is not None
+            old = self._poses(posture_at(self._before.motion, self._before.motion.q, t))
+        if m.reference is not None and layers["planned posture"]:
+            ghost = self._poses(posture_at(m, m.reference, t))
+        poses = self._poses(posture_at(m, m.q, t))
+        for pale, there in ((self._ghost, ghost), (self._old, old)):
+            if pale is not None:
+                pale.show(there, poses)
         self._robot.pose(poses)
         self._robot.fade(SEE_THROUGH if layers["see-through robot"] else None)
         supports = list(m.world.supports.values())
@@ -213,14 +258,20 @@ class Stage:
         facts = [f"{t:.2f} of {self.duration:.1f} s; {self.change_at(t)}"]
         if math.isfinite(m.margin[row]):
             facts.append(f"centre of mass {1000 * m.margin[row]:.0f} mm inside")
-        if self._ghost is not None and m.reference is not None:
-            self._ghost.root.visible = layers["planned posture"]
-            if layers["planned posture"]:
-                kin.update(posture_at(m, m.reference, t))
-                planned = body_poses(kin.data, self._meshes)
-                self._ghost.pose(planned)
-                self._ghost.show(apart(planned, poses))
         return paragraphs(facts)
+
+    def seen(self) -> np.ndarray:
+        """(n, 3) points that a camera has to have in view [m]."""
+        return seen_points(self._kin, self.motion.q)
+
+    def base(self, t: float) -> np.ndarray:
+        """(3,) where the robot's base is at a time [s], level with the ground [m]."""
+        return posture_at(self.motion, self.motion.q, t)[:3] * [1.0, 1.0, 0.0]
+
+    def _poses(self, q: np.ndarray) -> np.ndarray:
+        """(nb, 7) of the bodies at a posture, at which the kinematics stay."""
+        self._kin.update(q)
+        return body_poses(self._kin.data, self._meshes)
 
     def _show_arrows(self, row: int, t: float, on: bool) -> None:
         """Forces of physics, else of the keyframe near this time; and the push."""

@@ -102,7 +102,7 @@ def recording_named(source: str) -> str | None:
     return source if source and Path(source).is_file() else None
 
 
-def beside(
+def to_the_right(
     scene: Scene, points: np.ndarray, other: Scene, person: np.ndarray
 ) -> np.ndarray:
     """(3,) the way from the person's world to a place to the right of the robot's.
@@ -117,15 +117,15 @@ def beside(
     """
     yaw = float(scene.start[2])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])  # cameras stand to the left
-    here = np.concatenate([points, _corners(scene)]) @ right
-    there = np.concatenate([person, _corners(other)]) @ right
+    here = np.concatenate([points, corners(scene)]) @ right
+    there = np.concatenate([person, corners(other)]) @ right
     start = np.array([*scene.start[:2], 0.0])
     ahead = start - np.array([*other.start[:2], 0.0])
     ahead -= (ahead @ right) * right
     return ahead + (float(here.max()) - float(there.min()) + GAP) * right
 
 
-def _corners(scene: Scene) -> np.ndarray:
+def corners(scene: Scene) -> np.ndarray:
     """(8 n, 3) of the boxes [m]."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     corners = [b.position + (signs * b.size / 2) @ b.rotation.T for b in scene.boxes]

@@ -29,9 +29,23 @@ from clamber.model.scene import Scene
 from clamber.model.terrain import load_scene
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.planner import plan
-from clamber.planning.records import Budget, Method, Plan, PlanOptions
+from clamber.planning.records import (
+    Budget,
+    Method,
+    Plan,
+    PlanOptions,
+    Progress,
+    silent,
+)
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
+from clamber.run.folder import (
+    SEQUENCE,
+    save_plan,
+    save_rollout,
+    save_sequence,
+    save_verdict,
+)
 
 Contacts = Literal["any", "demonstrated"]
 
@@ -157,7 +171,9 @@ def scene_of(height: float | None, path: str | Path | None) -> Scene:
 
 
 @checks_types
-def run_climb(climb: Climb) -> ClimbResult:
+def run_climb(
+    climb: Climb, *, folder: Path | None = None, progress: Progress = silent
+) -> ClimbResult:
     """Detect, plan, simulate, judge.
 
     A scene out of the robot's reach and a plan that misses a step are results: the
@@ -165,16 +181,34 @@ def run_climb(climb: Climb) -> ClimbResult:
 
     Args:
         climb: Recording, robot, scene and how.
+        folder: Where what each stage made is saved, as soon as it is made.
+        progress: Called with stage, share and note.
+
+    Raises:
+        InputError: Recording, robot or scene cannot be used.
+        OSError: The folder cannot be written.
     """
+    # One process does many climbs that differ in their disturbances alone.
+    shared = replace(climb, controller="mixed", disturb=Disturbance())
     try:
-        # One process does many climbs that differ in their disturbances alone.
-        made = _planned(replace(climb, controller="mixed", disturb=Disturbance()))
+        if folder is None:
+            made = _planned(shared)
+        else:
+            made = _plan(shared, folder, progress)
         if not made.complete or made.trajectory is None:
             return ClimbResult(reached=False, why=f"no plan: {made.why_not}")
-        rollout = simulate(made, controller=climb.controller, disturbance=climb.disturb)
+        rollout = simulate(
+            made,
+            controller=climb.controller,
+            disturbance=climb.disturb,
+            progress=progress,
+        )
     except InputError as e:
         return ClimbResult(reached=False, why=f"no plan: {e}")
     verdict = judge(made, rollout)
+    if folder is not None:
+        save_rollout(made, rollout, folder)
+        save_verdict(verdict, folder)
     wrong = [str(name) for name, c in verdict.criteria.items() if not c.ok]
     if rollout.fell:
         wrong.insert(0, "fell")
@@ -196,7 +230,24 @@ def _detected(demo: str) -> ContactSequence:
 
 @functools.lru_cache(maxsize=4)
 def _planned(climb: Climb) -> Plan:
+    return _plan(climb, None, silent)
+
+
+def _plan(climb: Climb, folder: Path | None, progress: Progress) -> Plan:
+    """The plan of a climb; saved, with the sequence, where there is a folder for it."""
     robot, scene = load_robot(climb.robot), scene_of(climb.height, climb.scene)
-    world = (_detected(climb.demo), robot, scene)
-    options = PlanOptions(method=climb.method, speed=climb.speed)
-    return plan(*world, options=options, contacts=climb.contacts, budget=climb.search)
+    progress("detect", 0.0, "")
+    sequence = _detected(climb.demo)
+    made = plan(
+        sequence,
+        robot,
+        scene,
+        options=PlanOptions(method=climb.method, speed=climb.speed),
+        contacts=climb.contacts,
+        budget=climb.search,
+        progress=progress,
+    )
+    if folder is not None:
+        save_sequence(sequence, folder / SEQUENCE)
+        save_plan(made, folder)
+    return made

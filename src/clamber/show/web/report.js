@@ -124,6 +124,39 @@ const state = { t: 0, playing: false, speed: END > 40 ? 4 : END > 20 ? 2 : 1, gh
 const watchers = [];  // told of each new time
 const SCENES = [];
 
+// Long runs open at once: what is far from the screen is made when it comes near, or for
+// paper; of long lists one page is on the screen.
+const LATER = new Map(), PAGED = [];
+const near = new IntersectionObserver((seen) => seen.forEach((e) => e.isIntersecting && makeNow(e.target)), { rootMargin: "300px" });
+function later(place, make) {
+  LATER.set(place, make);
+  near.observe(place);
+  return place;
+}
+function makeNow(place) {
+  const make = LATER.get(place);
+  LATER.delete(place);
+  near.unobserve(place);
+  if (make) make();
+}
+// `fill(from, to)` shows items of a list; the buttons below say which.
+function paged(count, size, fill) {
+  if (count <= size) { fill(0, count); return null; }
+  const label = el("output"), turn = (way) => { first = Math.min(Math.max(0, first + way * size), Math.floor((count - 1) / size) * size); show(); };
+  let first = 0;
+  const button = (text, title, way) => el("button", { type: "button", "aria-label": title, title, onclick: () => turn(way) }, text);
+  const before = button("◀", "earlier", -1), after = button("▶", "later", 1);
+  const show = () => {
+    const last = Math.min(first + size, count);
+    [before.disabled, after.disabled] = [first === 0, last === count];
+    label.textContent = `${first} to ${last - 1} of 0 to ${count - 1}`;
+    fill(first, last);
+  };
+  PAGED.push({ all: () => fill(0, count), show });
+  show();
+  return el("div", { class: "pager" }, before, label, after);
+}
+
 const night = matchMedia("(prefers-color-scheme: dark)");
 let printing = false;
 function theme() {
@@ -292,19 +325,29 @@ function gantt(run, motion) {
 }
 
 // A plot of lines {name, at: row => number, colour, faint, dashed, bold: row => bool}.
-function plot(title, motion, lines, { limits = [], from = null, range, digits = 2 }) {
-  const height = 150, n = motion.times.length, values = lines.map((l) => motion.times.map((_, r) => l.at(r)));
-  let [low, high] = range;
+// Of more samples than the screen has columns, the lowest and the highest of each column.
+const COLUMNS = 500;
+function plot(title, motion, lines, values, { limits = [], range: [low, high], digits = 2 }) {
+  const height = 150, n = motion.times.length, wide = Math.ceil(n / COLUMNS);
   const y = (v) => height - (height * (v - low)) / (high - low || 1), x = (r) => (1000 * motion.times[r]) / (motion.end || 1);
   const shapes = ticks(low, high, 4).map((v) => el("line", { x1: 0, x2: 1000, y1: y(v), y2: y(v), class: "rule" }));
   limits.forEach(({ value, colour }) => shapes.push(el("line", { x1: 0, x2: 1000, y1: y(value), y2: y(value), class: "limit", stroke: colour || "#dc2626" })));
   const pathOf = (v, keep) => {
-    let d = "", pen = false;
+    let d = "", pen = false, least = -1, most = -1;
+    const put = () => {
+      for (const r of least < 0 ? [] : new Set([Math.min(least, most), Math.max(least, most)])) {
+        d += `${pen ? "L" : "M"}${x(r).toFixed(1)} ${y(v[r]).toFixed(1)}`;
+        pen = true;
+      }
+      least = most = -1;
+    };
     for (let r = 0; r < n; r++) {
-      if (Number.isNaN(v[r]) || (keep && !keep(r))) { pen = false; continue; }
-      d += `${pen ? "L" : "M"}${x(r).toFixed(1)} ${y(v[r]).toFixed(1)}`;
-      pen = true;
+      if (Number.isNaN(v[r]) || (keep && !keep(r))) { put(); pen = false; continue; }
+      if (least < 0 || v[r] < v[least]) least = r;
+      if (most < 0 || v[r] > v[most]) most = r;
+      if ((r + 1) % wide === 0) put();
     }
+    put();
     return d;
   };
   lines.forEach((l, i) => {
@@ -359,15 +402,21 @@ function heights(m, arms) {
 
 function plots() {
   const moving = MOTIONS.map((m) => (m && !m.stills ? m : null));
-  const made = PLOTS.map(([title, make]) => [title, RUNS.map((run, i) => (moving[i] ? make(run, moving[i]) : null))]).filter(([, specs]) => specs.some(Boolean));
-  if (!made.length) return null;
-  const figures = made.flatMap(([title, specs]) => {
-    const seen = specs.flatMap((s, i) => (s ? [...s.lines.flatMap((l) => moving[i].times.map((_, r) => l.at(r))), ...s.limits.map((l) => l.value)] : [])).filter((v) => !Number.isNaN(v));
-    let low = Infinity, high = -Infinity;
-    for (const v of seen) { low = Math.min(low, v); high = Math.max(high, v); }
-    const floor = specs.find(Boolean).floor, room = 0.06 * (high - low || 1), fixedRange = specs.find(Boolean).at;
-    const range = fixedRange && low >= fixedRange[0] && high <= fixedRange[1] ? fixedRange : [floor ?? low - room, high + room];
-    return specs.map((s, i) => (s ? plot(title, moving[i], s.lines, { ...s, range }) : el("div", {})));
+  if (!moving.some(Boolean)) return null;
+  const figures = PLOTS.flatMap(([title, make]) => {
+    const places = moving.map(() => el("div", { class: "place" }));
+    return later(places[0], () => {
+      const specs = RUNS.map((run, i) => moving[i] && make(run, moving[i]));
+      if (!specs.some(Boolean)) return places.forEach((p) => p.remove());
+      const values = specs.map((s, i) => (s ? s.lines.map((l) => moving[i].times.map((_, r) => l.at(r))) : []));
+      let low = Infinity, high = -Infinity;
+      const take = (v) => { if (!Number.isNaN(v)) [low, high] = [Math.min(low, v), Math.max(high, v)]; };
+      specs.forEach((s, i) => { values[i].forEach((line) => line.forEach(take)); if (s) s.limits.forEach((l) => take(l.value)); });
+      const { floor, at } = specs.find(Boolean), room = 0.06 * (high - low || 1);
+      const range = at && low >= at[0] && high <= at[1] ? at : [floor ?? low - room, high + room];
+      specs.forEach((s, i) => s && places[i].replaceWith(plot(title, moving[i], s.lines, values[i], { ...s, range })));
+      watchers.forEach((tell) => tell(state.t));
+    }), places;
   });
   return el("section", {}, el("h2", {}, "Over time"), el("div", { class: "plots" }, figures));
 }
@@ -381,37 +430,61 @@ const clickable = (time, label) => (time === null ? { class: "unreached", title:
 function sheet(run, motion, i) {
   const s = SCENES.find((x) => x.run === run);
   if (!s || !run.keyframes.length) return el("p", { class: "note" }, "No keyframes to draw.");
-  return el("div", { class: "sheet" }, run.keyframes.map((k, n) => el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` },
-    el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n }),
-    el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, holds a push of ${fixed(k.margin, 2)} weights`, k.time === null && el("em", {}, " — not reached")))));
+  const tile = (k, n) => {
+    const canvas = el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n });
+    later(canvas, () => { STILLS.push(canvas); drawStills(); });
+    return el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` }, canvas,
+      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, holds a push of ${fixed(k.margin, 2)} weights`, k.time === null && el("em", {}, " — not reached")));
+  };
+  const box = el("div", { class: "sheet" });
+  return [box, paged(run.keyframes.length, 12, (from, to) => box.replaceChildren(...run.keyframes.slice(from, to).map((k, n) => tile(k, from + n))))];
 }
 
-// Stills are drawn by the renderer of the animation: keyframes, once for each theme, and
-// the present picture for paper, since browsers print an older one of a WebGL canvas.
+// Stills are drawn by the renderer of the animation, one a frame: keyframes when they are
+// seen, anew for another theme, and the present picture for paper, since browsers print an
+// older one of a WebGL canvas.
+const STILLS = [];
 function still(s, onto, picture, camera) {
   s.scene.draw(picture, camera, theme(), onto.width, onto.height);
   onto.getContext("2d").drawImage(s.canvas, 0, 0);
+  onto.dataset.drawn = "";
 }
 function drawStills() {
-  const preset = DATA.presets[0];
-  for (const tile of document.querySelectorAll("canvas[data-keyframe]")) {
-    const s = SCENES.find((x) => x.run === RUNS[Number(tile.dataset.run)]);
+  const tile = STILLS.shift();
+  if (!tile) return;
+  if (tile.isConnected) {
+    const s = SCENES.find((x) => x.run === RUNS[Number(tile.dataset.run)]), preset = DATA.presets[0];
     still(s, tile, s.motion.keyframe(Number(tile.dataset.keyframe)), s.scene.fit(preset.azimuth, preset.elevation, tile.width / tile.height));
   }
+  if (printing) return drawStills();
+  paint();
+  if (STILLS.length) requestAnimationFrame(drawStills);
+}
+function restyle() {
+  STILLS.push(...document.querySelectorAll("canvas[data-drawn]:not(.paper)"));
+  drawStills();
+  paint();
+}
+function paper(on) {
+  printing = on;
+  PAGED.forEach((list) => (on ? list.all() : list.show()));
+  if (on) [...LATER.keys()].forEach(makeNow);
+  restyle();
   for (const s of SCENES) {
     [s.paper.width, s.paper.height] = [1600, 800];
-    if (printing) still(s, s.paper, s.motion.at(state.t, state.ghost), cameraOf(s, 2));
+    if (on) still(s, s.paper, s.motion.at(state.t, state.ghost), cameraOf(s, 2));
   }
-  paint();
 }
 
 function stances(run) {
   if (!run.keyframes.length) return el("p", { class: "note" }, "No plan.");
-  const rows = run.keyframes.flatMap((k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
+  const rows = (k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
-      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"]))));
+      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
+  const made = table(["", "move", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push [weights]", "limit"], [], "stances"), body = made.querySelector("tbody");
+  const pager = paged(run.keyframes.length, 20, (from, to) => body.replaceChildren(...run.keyframes.slice(from, to).flatMap((k, n) => rows(k, from + n))));
   const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "because"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
-  return [RUNS.length > 1 && el("h3", {}, run.title), table(["", "move", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push [weights]", "limit"], rows, "stances"), ...skipped];
+  return [RUNS.length > 1 && el("h3", {}, run.title), made, pager, ...skipped];
 }
 
 function verdict(run) {
@@ -421,7 +494,8 @@ function verdict(run) {
 function events(run, motion) {
   if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Nothing out of the ordinary was felt.");
   const time = (t) => (motion && !motion.stills ? t : null);
-  return table(["t [s]", "felt on the way"], run.events.map((e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]))), "events");
+  const made = table(["t [s]", "felt on the way"], [], "events"), row = (e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]));
+  return [made, paged(run.events.length, 40, (from, to) => made.querySelector("tbody").replaceChildren(...run.events.slice(from, to).map(row)))];
 }
 const pairs = (title, rows) => rows.length > 0 && el("div", {}, el("h3", {}, title), table(["", ""], rows.map(([k, v]) => el("tr", {}, cells([k, v]))), "pairs"));
 
@@ -445,13 +519,10 @@ function build() {
     const act = { " ": () => play(!state.playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1) }[e.key];
     if (act) { e.preventDefault(); act(); }
   });
-  const restyle = () => { if (SCENES.length) drawStills(); };
   night.addEventListener("change", restyle);
-  const paper = (on) => { printing = on; restyle(); };
   addEventListener("beforeprint", () => paper(true));
   addEventListener("afterprint", () => paper(false));
   go(0);
-  requestAnimationFrame(restyle);
 }
 
 build();
