@@ -14,8 +14,9 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -27,14 +28,16 @@ REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: the robot made it (or the command did its work), it did not, bad
 input, interrupted, nobody reads the output any more (as in `clamber ... | head`)."""
 
+Switch = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """How results are shown."""
 
-    json: bool = False
+    json: Switch = False
     """Print the result as one JSON object."""
-    quiet: bool = False
+    quiet: Switch = False
     """No progress, no table: files and exit code only."""
 
     @contextlib.contextmanager

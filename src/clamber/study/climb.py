@@ -50,6 +50,7 @@ class Climb:
         controller: `pid` or `mixed`.
         contacts: `any`: others than the demonstrated ones where those have no stable
             plan; or `demonstrated` only.
+        budget: Of all planning [s]; None: no bound.
         search: How far to search for other contacts.
         disturb: What the planner does not know.
     """
@@ -62,6 +63,7 @@ class Climb:
     speed: float | Literal["max"] = field(default_factory=lambda: PlanOptions().speed)
     controller: ControlMode = DEFAULT_CONTROLLER
     contacts: Contacts = "any"
+    budget: float | None = None
     search: Budget = field(default_factory=Budget)
     disturb: Disturbance = field(default_factory=Disturbance)
 
@@ -99,7 +101,10 @@ class ClimbResult:
 _CLIMB: pydantic.TypeAdapter[Climb] = pydantic.TypeAdapter(Climb)
 GROUPS = {"search": Budget, "disturb": Disturbance}  # flags such as `disturb.mass`
 FLAGS = tuple(f.name for f in fields(Climb) if f.name not in GROUPS) + tuple(
-    f"{group}.{f.name}" for group, kind in GROUPS.items() for f in fields(kind)
+    f"{group}.{f.name}"
+    for group, kind in GROUPS.items()
+    for f in fields(kind)
+    if (group, f.name) != ("search", "seconds")  # that is `budget`
 )
 
 
@@ -199,4 +204,7 @@ def _planned(climb: Climb) -> Plan:
     robot, scene = load_robot(climb.robot), scene_of(climb.height, climb.scene)
     world = (_detected(climb.demo), robot, scene)
     options = PlanOptions(method=climb.method, speed=climb.speed)
-    return plan(*world, options=options, contacts=climb.contacts, budget=climb.search)
+    budget = climb.search
+    if climb.budget is not None:
+        budget = replace(budget, seconds=climb.budget)
+    return plan(*world, options=options, contacts=climb.contacts, budget=budget)
