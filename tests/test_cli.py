@@ -131,6 +131,10 @@ def test_every_command_explains_itself_and_has_json_and_quiet(capsys: Capture):
         assert f"clamber {name}" in text
         assert "--json" in text
         assert "--quiet" in text
+        assert "{None}" not in text
+        if name not in ("climb", "simulate", "traverse"):  # with --disturb.friction
+            assert "(default: None)" not in text
+            assert "(default: False)" not in text
 
 
 def test_version_is_that_of_the_package(capsys: Capture):
@@ -438,10 +442,15 @@ def test_a_plan_without_any_step_is_not_simulated(
 
 MISTAKES = {
     "": ("Expected one of {climb, contacts", "clamber --help"),
-    "nonsense": ("nonsense", "clamber --help"),
+    "nonsense": ("'nonsense'", "climb, contacts, plan"),
+    "clmb": ("'clmb'", "did you mean climb?"),
     "plan": ("SEQUENCE", "clamber plan --help"),
     "climb --hieght 0.3": ("--hieght", "--height METRES"),
-    "climb --height abc": ("--height", "['abc']"),
+    "climb --height abc": ("--height", "a number, got 'abc'"),
+    "climb --budget soon": ("--budget", "a number, got 'soon'"),
+    "climb --budget -1": ("--budget is -1.0", "expected 0 or more"),
+    "sweep spec.yaml --workers 1.5": ("--workers", "a whole number, got '1.5'"),
+    "climb --robot tals": ("--robot is 'tals'", "did you mean talos?"),
     "climb --speed fast": ("--speed", "'fast'"),
     "climb --method luck": ("'luck'", "gradient"),
     "climb --controller magic": ("'magic'", "'mixed'"),

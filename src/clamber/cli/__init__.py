@@ -42,9 +42,9 @@ def parse(args: Sequence[str]) -> Any:
         of = f"clamber {name}"
         return tyro.cli(COMMANDS[name], prog=of, args=list(args[1:]), **config)
     if name is not None:
-        near = difflib.get_close_matches(name, COMMANDS, n=1)
-        known = f"did you mean {near[0]}?" if near else f"one of {', '.join(COMMANDS)}"
-        raise InputError(f"a command: {known}", value=name, source="clamber")
+        near = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.7)
+        known = f"did you mean {near[0]}?" if near else ", ".join(COMMANDS)
+        raise InputError(f"there is no command {name!r}: {known}")
     return tyro.extras.subcommand_cli_from_dict(
         COMMANDS, prog="clamber", description=DESCRIPTION, args=list(args), **config
     )
