@@ -320,7 +320,7 @@ def test_a_plan_and_its_run_leave_the_files_of_the_format(
     assert sum(seconds.values()) > seconds["simulate"] > 0
     cli.main(["simulate", "made", "--controller", "pid"])
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last.startswith("the robot did not make it (")
+    assert last.startswith("failed: ")
     assert last.endswith("`clamber report made` shows how far it came")
 
 
@@ -435,7 +435,7 @@ def test_a_plan_without_any_step_is_not_simulated(
     quick_climb.plan = replace(quick_climb.plan, trajectory=None, complete=False)
     assert cli.main(["climb", "--height", "0.25", "--out", str(tmp_path / "a")]) == 1
     assert "simulate" not in quick_climb.calls
-    assert "the robot cannot do it" in capsys.readouterr().out.splitlines()[-1]
+    assert "no plan: " in capsys.readouterr().out.splitlines()[-1]
 
 
 # Mistakes: what is said of them, and what to do instead.

@@ -1,6 +1,6 @@
 """The command line: `main` parses the flags of a command and runs it.
 
-Exit codes: 0 the robot made it (or the command did its work), 1 it did not, 2 bad
+Exit codes: 0 success (or the command did its work), 1 failure, 2 bad
 input, 130 interrupted, 141 nobody reads the output any more.
 """
 

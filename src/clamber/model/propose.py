@@ -142,8 +142,8 @@ def propose_robot(
         ankles = [tree.name(j) for c in legs for j in c.joints[c.bend + 1 :]]
     else:
         notes.append(
-            f"across its wrists a hand bears {bears:.0f} N: too little for ankles to"
-            " give way, so none positions itself"
+            f"a hand supports {bears:.0f} N across its wrist: too little for compliant"
+            " (self-positioning) ankles, so they stay stiff"
         )
     spec, files = build_spec(name, tree, found, shapes, apart, drives)
     spec.compile()

@@ -191,7 +191,7 @@ def change_contact(
                 return found
         failure = failure or found
     if failure is None:
-        why = "nothing else bears load"
+        why = "no other contact is loaded"
         return Failure(status=Status.UNBALANCED, step=step, detail=why)
     return failure
 

@@ -87,7 +87,7 @@ class ClimbResult:
         reached: The verdict.
         why: What failed first; empty where nothing did.
         seconds: Of motion, until the end or the fall [s]; 0 where there was no plan.
-        replans: How often the rest was planned again on the way.
+        replans: How often the rest was replanned during execution.
         effort: Largest effort of any joint, share of its limit.
     """
 

@@ -6,7 +6,7 @@
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const RUNS = DATA.runs;
 const PALETTE = ["#2563eb", "#0891b2", "#c2410c", "#d97706", "#7c3aed", "#db2777", "#15803d", "#65a30d", "#475569", "#b91c1c"];
-const PHASES = { supporting: "#16a34a", "reach-to-supportable": "#eab308", sliding: "#dc2626" };
+const PHASES = { supporting: "#16a34a", "reach-to-supportable": "#eab308", sliding: "#4f46e5" };
 const NONE = -32768;
 
 // An element with attributes, listeners (`onclick`) and children; text is text.
@@ -288,7 +288,7 @@ function gantt(run, motion) {
   return el("div", { class: "gantt" },
     el("div", { class: "names" }, names.map((name) => el("span", {}, name))),
     el("div", {}, strip(motion.end, names.length * row, shapes), timeAxis(motion.end)),
-    el("p", { class: "note" }, `Thin: planned. ${motion.loads ? "Bold: loaded in physics, gaps and touches below 60 ms left out. " : ""}Dashed lines: keyframes.${motion.felt.length ? " Red: something was felt." : ""} Time in s; drag to scrub.`));
+    el("p", { class: "note" }, `Thin: planned. ${motion.loads ? "Bold: loaded in physics, gaps and touches below 60 ms left out. " : ""}Dashed lines: keyframes.${motion.felt.length ? " Red: an event of the execution." : ""} Time in s; drag to scrub.`));
 }
 
 // A plot of lines {name, at: row => number, colour, faint, dashed, bold: row => bool}.
@@ -346,8 +346,8 @@ const PLOTS = [
     if (m.arrays.pushSize) lines.push({ name: "push on the pelvis", colour: "#a21caf", at: (r) => m.arrays.pushSize(r) });
     return { lines, limits: [{ value: m.weight, name: "weight", colour: "#64748b" }], floor: 0, digits: 0 };
   }],
-  ["Projected distance, share of its limit", (run, m) => m.arrays.ratio && {
-    lines: m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => ((m.arrays.loaded || m.arrays.planned)(r, j) > 0 ? m.arrays.ratio(r, j) : NaN) })), limits: [{ value: 1, name: "limit" }], floor: 0 }],
+  ["Projected distance, share of its guide value", (run, m) => m.arrays.ratio && {
+    lines: m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => ((m.arrays.loaded || m.arrays.planned)(r, j) > 0 ? m.arrays.ratio(r, j) : NaN) })), limits: [{ value: 1, name: "guide value", colour: "#64748b" }], floor: 0 }],
   ["Heights of the arms' surfaces [m]; bold: loaded", (run, m) => heights(m, true)],
   ["Heights of the legs' surfaces [m]; bold: loaded", (run, m) => heights(m, false)],
 ];
@@ -383,7 +383,7 @@ function sheet(run, motion, i) {
   if (!s || !run.keyframes.length) return el("p", { class: "note" }, "No keyframes to draw.");
   return el("div", { class: "sheet" }, run.keyframes.map((k, n) => el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` },
     el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n }),
-    el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, holds a push of ${fixed(k.margin, 2)} weights`, k.time === null && el("em", {}, " — not reached")))));
+    el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")))));
 }
 
 // Stills are drawn by the renderer of the animation: keyframes, once for each theme, and
@@ -410,8 +410,8 @@ function stances(run) {
   const rows = run.keyframes.flatMap((k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
       el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"]))));
-  const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "because"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
-  return [RUNS.length > 1 && el("h3", {}, run.title), table(["", "move", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push [weights]", "limit"], rows, "stances"), ...skipped];
+  const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "reason"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
+  return [RUNS.length > 1 && el("h3", {}, run.title), table(["", "contact change", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push margin [m g]", "limited by"], rows, "stances"), ...skipped];
 }
 
 function verdict(run) {
@@ -419,9 +419,9 @@ function verdict(run) {
   return table(["criterion", "value", "limit", ""], run.criteria.map((c) => el("tr", { class: c.ok ? "" : "failed" }, cells([c.name, c.value, c.limit, c.ok ? "ok" : "NO"]))), "verdict");
 }
 function events(run, motion) {
-  if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Nothing out of the ordinary was felt.");
+  if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Every contact was measured where it was planned.");
   const time = (t) => (motion && !motion.stills ? t : null);
-  return table(["t [s]", "felt on the way"], run.events.map((e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]))), "events");
+  return table(["t [s]", "measured during execution"], run.events.map((e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]))), "events");
 }
 const pairs = (title, rows) => rows.length > 0 && el("div", {}, el("h3", {}, title), table(["", ""], rows.map(([k, v]) => el("tr", {}, cells([k, v]))), "pairs"));
 
