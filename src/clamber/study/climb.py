@@ -70,11 +70,15 @@ class Climb:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Check that there is one scene.
+        """Check that there is one scene, and one bound.
 
         Raises:
-            InputError: Height and scene, or neither.
+            InputError: Height and scene, or neither; a budget below 0, or two.
         """
+        if self.budget is not None and not self.budget >= 0:
+            raise InputError("0 or more", field="budget", value=self.budget)
+        if self.search.seconds is not None:
+            raise InputError("no bound: that is `budget`", field="search.seconds")
         if (self.height is None) == (self.scene is None):
             raise InputError("height or scene, one of them", field="height")
 
@@ -204,7 +208,5 @@ def _planned(climb: Climb) -> Plan:
     robot, scene = load_robot(climb.robot), scene_of(climb.height, climb.scene)
     world = (_detected(climb.demo), robot, scene)
     options = PlanOptions(method=climb.method, speed=climb.speed)
-    budget = climb.search
-    if climb.budget is not None:
-        budget = replace(budget, seconds=climb.budget)
+    budget = replace(climb.search, seconds=climb.budget)
     return plan(*world, options=options, contacts=climb.contacts, budget=budget)
