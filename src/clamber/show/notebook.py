@@ -23,6 +23,7 @@ from clamber.contact.contact import PARTS, ContactSequence
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict, judge
+from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
 from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
@@ -30,7 +31,7 @@ from clamber.run.figures import finish_axes
 from clamber.run.folder import save_plan, save_rollout, save_verdict
 from clamber.show.live import open_view
 from clamber.show.page import Page
-from clamber.show.renderer import Camera, view_of
+from clamber.show.renderer import Camera, seen_points, view_of
 from clamber.show.skeleton import skeleton_of
 
 TILE = (220, 220)  # [px] of a posture
@@ -199,7 +200,8 @@ def _strip(world: World, postures: Sequence[np.ndarray] | np.ndarray) -> bytes |
     strip = Image.new("RGB", (TILE[0] * len(chosen), TILE[1]))
     try:
         with Camera(world, TILE) as camera:
-            look = view_of(world, chosen, TILE[0] / TILE[1])
+            seen = seen_points(Kinematics(world), np.array(chosen))
+            look = view_of(world, seen, TILE[0] / TILE[1])
             for k, q in enumerate(chosen):
                 strip.paste(camera.shot(q, look), (k * TILE[0], 0))
     except ClamberError:
