@@ -14,6 +14,7 @@ from clamber.cli import commands, parse
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.verdict import Figure
+from clamber.planning.records import Budget
 from clamber.study.climb import FLAGS, Climb, climb_of, command_of, run_climb
 
 
@@ -30,6 +31,7 @@ def parsed(command: str) -> commands.ClimbCommand:
         Climb(
             height=0.3, robot="coman29", controller="pid", speed=0.05, method="lbfgs"
         ),
+        Climb(height=0.3, budget=2.5, search=Budget(tries=7)),
         Climb(height=0.3, speed="max", demo="a file.yaml", robot="my robots/it's.yaml"),
         Climb(scene="boxes.yaml", disturb=Disturbance(height=-5e-05, x=-0.1, seed=17)),
         Climb(
@@ -60,7 +62,9 @@ def test_the_command_of_a_job_is_that_job(job: Climb):
     assert climb.planning.speed == job.speed
     assert climb.execution.controller == job.controller
     assert climb.execution.disturb == job.disturb
-    assert (climb.contacts, climb.search.read()["budget"]) == (job.contacts, job.search)
+    assert climb.contacts == job.contacts
+    bounds = climb.search.read(climb.planning)["budget"]
+    assert bounds == replace(job.search, seconds=job.budget)
 
 
 def test_a_command_names_what_differs_and_no_more():
@@ -79,7 +83,9 @@ def test_flags_have_the_defaults_of_the_command():
     assert (climb.planning.method, climb.planning.speed) == (job.method, job.speed)
     assert climb.execution.controller == job.controller
     assert climb.execution.disturb == job.disturb
-    assert (climb.contacts, climb.search.read()["budget"]) == (job.contacts, job.search)
+    assert climb.contacts == job.contacts
+    bounds = climb.search.read(climb.planning)["budget"]
+    assert bounds == replace(job.search, seconds=job.budget)
 
 
 def test_flags_are_checked_one_by_one():
@@ -93,6 +99,8 @@ def test_flags_are_checked_one_by_one():
         ({}, "height or scene, one of them"),
         ({"height": 0.3, "search.tries": -1}, "search.tries is -1"),
         ({"height": 0.3, "contacts": "none"}, "contacts is 'none'"),
+        ({"height": 0.3, "budget": -1.0}, "budget is -1.0"),
+        ({"height": 0.3, "search.seconds": 1.0}, "flag is 'search.seconds'"),
     ):
         with pytest.raises(InputError) as wrong:
             climb_of(flags)

@@ -392,7 +392,7 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
         tab.wait_for_selector("text=Planned to the last stance: 1 changes")
         view.until(lambda: view.orange() > ENOUGH, "the robot of the new plan")
         view.click("Simulate")
-        tab.wait_for_selector("text=Physics: it did not make it")
+        tab.wait_for_selector("text=Physics: failed")
         view.until(lambda: view.orange() > ENOUGH, "the robot of the new run")
         view.click("Save")
         tab.wait_for_selector("text=Saved as")

@@ -354,7 +354,8 @@ def test_a_home_beyond_the_effort_limits_is_refused_with_the_joint_that_gives_wa
     (tmp_path / "weak.xml").write_text(weak)
     robot = replace(coman, path=tmp_path / "weak.xml")
     with pytest.raises(
-        InputError, match=r"Knee\w* would have to bear [\d.]+ N m; [\d.]+ of its 3 "
+        InputError,
+        match=r"Knee\w* would need [\d.]+ N m; [\d.]+ N m of its limit of 3 ",
     ) as error:
         plan(demo_sequence, robot, Scene.from_height(0.275))
     assert error.value.field == "robot.home"

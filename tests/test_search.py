@@ -134,7 +134,7 @@ def test_a_step_out_of_reach_is_skipped_with_its_reason_and_the_rest_goes_on(ik,
 def test_a_move_that_leaves_nothing_to_stand_on_is_refused(ik, steps):
     step = Step(limb="left_leg", breaks=("LFoot", "RFoot"), makes=None)
     failure = change_contact(ik, standing(ik, OPTIONS), step, OPTIONS)
-    assert str(failure) == "LFoot, RFoot -> air: nothing else bears load"
+    assert str(failure) == "LFoot, RFoot -> air: no other contact is loaded"
 
 
 def test_nothing_to_do_finds_the_start_alone(ik):

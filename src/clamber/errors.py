@@ -107,10 +107,15 @@ class Status(enum.Enum):
 
     SOLVED = "solved"
     UNREACHABLE = "a contact cannot be reached: move the contact or the obstacle"
-    UNBALANCED = "the centre of mass cannot be held over the supporting contacts"
-    COLLIDING = "links collide or come closer than the safety distance"
-    SLIDING = "a new contact cannot support its mass within the friction cone"
-    OVERLOADED = "no contact forces within the friction cones and torque limits hold it"
+    UNBALANCED = "the centre of mass cannot be kept inside the support polygon"
+    COLLIDING = "collision: links come closer than the safety distance"
+    SLIDING = (
+        "the new contact is outside its contact-angle bound: it would slip when loaded"
+    )
+    OVERLOADED = (
+        "no static equilibrium: no contact forces within friction cones and torque"
+        " limits"
+    )
     STUCK = "no contact change brings the robot nearer to its goal"
     EXHAUSTED = "every contact within the budget was tried"
     BUDGET = "the budget of tries or seconds was spent: allow more"

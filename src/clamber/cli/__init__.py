@@ -1,11 +1,12 @@
 """The command line: `main` parses the flags of a command and runs it.
 
-Exit codes: 0 the robot made it (or the command did its work), 1 it did not, 2 bad
+Exit codes: 0 success (or the command did its work), 1 failure, 2 bad
 input, 130 interrupted, 141 nobody reads the output any more.
 """
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 from collections.abc import Sequence
@@ -14,7 +15,8 @@ from typing import Any
 import tyro
 
 import clamber
-from clamber.cli.commands import Command
+from clamber.cli.commands import COMMANDS
+from clamber.cli.flags import REGISTRY
 from clamber.cli.output import BAD_INPUT, INTERRUPTED, REACHED, READER_GONE
 from clamber.errors import ClamberError, InputError
 
@@ -28,14 +30,23 @@ def parse(args: Sequence[str]) -> Any:
     """The command that flags ask for.
 
     Raises:
+        InputError: There is no such command.
         SystemExit: With 2, what is wrong written on stderr; with 0 after help.
     """
-    return tyro.cli(
-        Command,
-        prog="clamber",
-        description=DESCRIPTION,
-        args=list(args),
-        config=(tyro.conf.FlagCreatePairsOff,),
+    name = args[0] if args and not args[0].startswith("-") else None
+    config: dict[str, Any] = {
+        "config": (tyro.conf.FlagCreatePairsOff,),
+        "registry": REGISTRY,
+    }
+    if name in COMMANDS:  # alone, so that mistakes are told of this command
+        of = f"clamber {name}"
+        return tyro.cli(COMMANDS[name], prog=of, args=list(args[1:]), **config)
+    if name is not None:
+        near = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.7)
+        known = f"did you mean {near[0]}?" if near else ", ".join(COMMANDS)
+        raise InputError(f"there is no command {name!r}: {known}")
+    return tyro.extras.subcommand_cli_from_dict(
+        COMMANDS, prog="clamber", description=DESCRIPTION, args=list(args), **config
     )
 
 

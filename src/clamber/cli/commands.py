@@ -13,7 +13,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -27,6 +27,7 @@ from clamber.cli.flags import (
     Place,
     PlanningFlags,
     Printed,
+    RobotName,
     RunFolder,
     SearchFlags,
     WorldFlags,
@@ -39,6 +40,7 @@ from clamber.cli.output import (
     REACHED,
     Clock,
     Output,
+    Switch,
     closing,
     conclude,
     filling,
@@ -70,7 +72,7 @@ class ClimbCommand:
 
     demo: Annotated[str, shown("RECORDING|NAME")] = "climb"
     """A recording, or a built-in demonstration (climb, crossing)."""
-    fit_floor: bool = False
+    fit_floor: Switch = False
     """Correct the heights of the recording's floor and boxes by what rests on them."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
@@ -79,7 +81,7 @@ class ClimbCommand:
     search: SearchFlags = field(default_factory=SearchFlags)
     """How far to look for contacts that nobody demonstrated."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
-    video: bool = False
+    video: Switch = False
     """Draw a video too, not pictures alone."""
     out: Place = None
     """The run folder (runs/climb, then runs/climb-2 ...)."""
@@ -88,7 +90,9 @@ class ClimbCommand:
     def run(self) -> int:
         """Recording to verdict."""
         robot, scene = self.world.load()
-        others = None if self.contacts == "demonstrated" else self.search.read()
+        others = (
+            None if self.contacts == "demonstrated" else self.search.read(self.planning)
+        )
         clock = Clock()
         track = Track("detect", *PLANNING, *EXECUTION, *_drawing(self.video))
         with drawing_aside() as draw:
@@ -123,7 +127,7 @@ class ContactsCommand:
     """A recording, recording.yaml, or a built-in demonstration by name."""
     scene: Annotated[Path | None, shown("FILE")] = None
     """The scene.yaml it was recorded in, where the recording has none."""
-    fit_floor: bool = False
+    fit_floor: Switch = False
     """Correct the heights of floor and boxes by what rests on them."""
     out: Place = None
     """The run folder (runs/contacts, then runs/contacts-2 ...)."""
@@ -233,14 +237,14 @@ class ReplanCommand:
 
         sequence = clamber.load_sequence(self.source)
         robot, scene = self.world.load()
-        others = self.search.read()
+        others = self.search.read(self.planning)
         stages = Track("plan", "save")
         with self.output.progress(stages) as report, self.world.blamed():
             found = clamber.replan(
                 sequence,
                 robot,
                 scene,
-                options=clamber.PlanOptions(**asdict(self.planning)),
+                options=self.planning.options(),
                 **others,
                 progress=report,
             )
@@ -275,7 +279,7 @@ class ReplanCommand:
             scene = made.world.scene
         else:
             scene = scene_of(self.world.height, self.world.scene)
-        others = self.search.read()
+        others = self.search.read(self.planning)
         q, touching = load_state(made, self.source, begin)
         stages = Track(*PLANNING)
         with self.output.progress(stages) as report, self.world.blamed():
@@ -316,13 +320,13 @@ class TraverseCommand:
     """A policy.json, as `clamber learn` writes it."""
     scene: Annotated[Path, shown("FILE")]
     """A scene.yaml."""
-    robot: str = "coman"
+    robot: RobotName = "coman"
     """A built-in robot by name, or a robot.yaml."""
     planning: Annotated[PlanningFlags, Flat]
     max_changes: int = default_of("planning.records", "PlanOptions", "max_changes")
     """Contact changes at most."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
-    video: bool = False
+    video: Switch = False
     """Draw a video too, not pictures alone."""
     out: Place = None
     """The run folder (runs/traverse, then runs/traverse-2 ...)."""
@@ -337,9 +341,8 @@ class TraverseCommand:
         policy = clamber.load_policy(self.policy)
         scene = clamber.load_scene(self.scene)
         robot = clamber.load_robot(self.robot)
-        options = clamber.PlanOptions(
-            **asdict(self.planning), max_changes=self.max_changes
-        )
+        options = self.planning.options(max_changes=self.max_changes)
+        budget = self.planning.bound()
         clock = Clock()
         world = WorldFlags(robot=self.robot, scene=self.scene)
         track = Track(*PLANNING, *EXECUTION, *_drawing(self.video))
@@ -347,7 +350,12 @@ class TraverseCommand:
             report = clock.watching(show)
             with world.blamed():
                 plan = clamber.plan(
-                    policy, robot, scene, options=options, progress=report
+                    policy,
+                    robot,
+                    scene,
+                    options=options,
+                    budget=budget,
+                    progress=report,
                 )
             folder = clamber.new_run_folder(self.out, "traverse")
             with filling(folder):
@@ -448,22 +456,22 @@ def _sequence(name: str) -> clamber.ContactSequence:
     return clamber.detect_contacts(clamber.load_demo(name))
 
 
-Command = (
-    Annotated[ClimbCommand, tyro.conf.subcommand("climb")]
-    | Annotated[ContactsCommand, tyro.conf.subcommand("contacts")]
-    | Annotated[PlanCommand, tyro.conf.subcommand("plan")]
-    | Annotated[ReplanCommand, tyro.conf.subcommand("replan")]
-    | Annotated[TraverseCommand, tyro.conf.subcommand("traverse")]
-    | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
-    | Annotated[LearnCommand, tyro.conf.subcommand("learn")]
-    | Annotated[RenderCommand, tyro.conf.subcommand("render")]
-    | Annotated[ReportCommand, tyro.conf.subcommand("report")]
-    | Annotated[ViewCommand, tyro.conf.subcommand("view")]
-    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
-    | Annotated[SceneCommand, tyro.conf.subcommand("scene")]
-    | Annotated[RobotCommand, tyro.conf.subcommand("robot")]
-    | Annotated[SweepCommand, tyro.conf.subcommand("sweep")]
-)
+COMMANDS = {
+    "climb": ClimbCommand,
+    "contacts": ContactsCommand,
+    "plan": PlanCommand,
+    "replan": ReplanCommand,
+    "traverse": TraverseCommand,
+    "simulate": SimulateCommand,
+    "learn": LearnCommand,
+    "render": RenderCommand,
+    "report": ReportCommand,
+    "view": ViewCommand,
+    "export": ExportCommand,
+    "scene": SceneCommand,
+    "robot": RobotCommand,
+    "sweep": SweepCommand,
+}
 
 
 PLANNING, EXECUTION = ("plan", "trajectory", "save"), ("simulate", "save run")
@@ -483,14 +491,13 @@ def _plan(
     others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
     """Plan and save; `others`: how others are looked for where the shown ones fail."""
-    options = clamber.PlanOptions(**asdict(flags))
     result = clamber.plan(
         sequence,
         robot,
         scene,
-        options=options,
+        options=flags.options(),
         contacts="demonstrated" if others is None else "any",
-        **(others or {}),
+        **(others or {"budget": flags.bound()}),
         progress=report,
     )
     report("save", 0.0, "")

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -37,10 +38,46 @@ Flat = tyro.conf.OmitArgPrefixes
 Printed = Annotated[Output, Flat]
 
 
+REGISTRY = tyro.constructors.ConstructorRegistry()
+
+
+@REGISTRY.primitive_rule
+def _left_out(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec | None:
+    """A number or a file that may be left out: no value stands for that."""
+    kinds = get_args(info.type)
+    kind, *others = [k for k in kinds if k is not NoneType] or [None]
+    if NoneType not in kinds or others or kind not in (int, float, str, Path):
+        return None
+    word = "a whole number" if kind is int else "a number"
+
+    def value(texts: list[str]) -> Any:
+        try:
+            return kind(texts[0])
+        except ValueError as e:
+            raise ValueError(f"expected {word}, got {texts[0]!r}") from e
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar={int: "N", float: "X", str: "TEXT", Path: "FILE"}[kind],
+        instance_from_str=value,
+        is_instance=lambda x: x is None or isinstance(x, kind),
+        str_from_instance=lambda x: [str(x)],
+    )
+
+
 def shown(metavar: str, default: str | None = None) -> Any:
     """How a flag's value is called in help, and its default, where that is no value."""
-    hint = None if default is None else f"(default: {default})"
+
+    def hint(value: str) -> str:
+        told = value if default is None else default
+        return "" if told in ("None", "False") else f"(default: {told})"
+
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
+
+
+RobotName = Annotated[str, shown("NAME|FILE")]
 
 
 Place = Annotated[Path | None, shown("DIR")]
@@ -53,14 +90,9 @@ RunFolder = Annotated[Path, tyro.conf.Positional, shown("RUN")]
 class WorldFlags:
     """Which robot, and where."""
 
-    robot: str = "coman"
-    """A built-in robot by name, or a robot.yaml."""
-    height: Annotated[
-        float | None,
-        tyro.conf.arg(
-            metavar="METRES", help_behavior_hint=f"(default: {DEFAULT_HEIGHT})"
-        ),
-    ] = None
+    robot: RobotName = "coman"
+    """A robot by name, or a robot.yaml."""
+    height: Annotated[float | None, shown("METRES", f"{DEFAULT_HEIGHT}")] = None
     """One box of 1.0 x 1.2 m with this height, 0.23 m before the ankles."""
     scene: Annotated[
         Path | None,
@@ -100,6 +132,21 @@ class PlanningFlags:
         "planning.records", "PlanOptions", "speed"
     )
     """Largest joint speed; max: as fast as joints and contacts bear."""
+    budget: Annotated[float | None, shown("SECONDS", "no bound")] = None
+    """For all planning; with a bound, what is found depends on the machine."""
+
+    def options(self, **more: Any) -> clamber.PlanOptions:
+        """With other options of planning."""
+        return clamber.PlanOptions(method=self.method, speed=self.speed, **more)
+
+    def bound(self, **more: Any) -> clamber.Budget:
+        """The budget, with other bounds."""
+        try:
+            return clamber.Budget(seconds=self.budget, **more)
+        except InputError as e:
+            name = str(e.field).removesuffix(".seconds")
+            flag = "budget" if name == "search" else name
+            raise InputError(e.expected, source=f"--{flag}", value=e.value) from e
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,28 +157,13 @@ class SearchFlags:
     """Steps that are planned at most; 0: no search."""
     depth: int = default_of("planning.records", "Budget", "depth")
     """Contact changes of a sequence at most."""
-    seconds: Annotated[
-        float | None, tyro.conf.arg(help_behavior_hint="(default: no bound)")
-    ] = None
-    """Of all planning; with a bound, what is found depends on the machine."""
-    policy: Annotated[
-        Path | None,
-        tyro.conf.arg(help_behavior_hint="(default: the sequence's own)"),
-    ] = None
+    policy: Annotated[Path | None, shown("FILE", "the sequence's own")] = None
     """policy.json whose demonstrations say which contacts are tried first."""
 
-    def read(self) -> dict[str, Any]:
+    def read(self, planning: PlanningFlags) -> dict[str, Any]:
         """The arguments of the functions that search."""
-        return {"budget": self._budget(), "counts": self._counts()}
-
-    def _budget(self) -> clamber.Budget:
-        try:
-            return clamber.Budget(
-                tries=self.tries, depth=self.depth, seconds=self.seconds
-            )
-        except InputError as e:
-            source = f"--{e.field}"
-            raise InputError(e.expected, source=source, value=e.value) from e
+        budget = planning.bound(tries=self.tries, depth=self.depth)
+        return {"budget": budget, "counts": self._counts()}
 
     def _counts(self) -> Any:
         from clamber.planning.free import policy_counts

@@ -14,8 +14,9 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -24,17 +25,19 @@ from clamber.cli.progress import Report, Track, bar, lines
 from clamber.execution.events import event_fields
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
-"""The exit codes: the robot made it (or the command did its work), it did not, bad
+"""The exit codes: success (or the command did its work), failure, bad
 input, interrupted, nobody reads the output any more (as in `clamber ... | head`)."""
+
+Switch = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
     """How results are shown."""
 
-    json: bool = False
+    json: Switch = False
     """Print the result as one JSON object."""
-    quiet: bool = False
+    quiet: Switch = False
     """No progress, no table: files and exit code only."""
 
     @contextlib.contextmanager
@@ -194,7 +197,14 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
 def keyframe_tables(record: Mapping[str, Any]) -> list[Table]:
     """The keyframes of a record: how each was found, and where its contacts are."""
     found = new_table(
-        "move", "iter", "time [s]", "cost", "after", "CoM [mm]", "push", "limit"
+        "contact change",
+        "iter",
+        "time [s]",
+        "cost",
+        "after",
+        "CoM [mm]",
+        "push [m g]",
+        "limited by",
     )
     keys = record["keyframes"]
     for k in keys:
@@ -233,7 +243,7 @@ def outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
         return _after_fallback(plan, "planned to the last stance")
-    return f"the robot cannot do it: {plan.fallback or plan.why_not}"
+    return f"no plan: {plan.fallback or plan.why_not}"
 
 
 def _after_fallback(plan: clamber.Plan, note: str) -> str:
@@ -251,7 +261,7 @@ def skipped_tables(plan: clamber.Plan) -> list[Table]:
     rows = [(str(s.stance), s.reason) for s in plan.skipped]
     for f in plan.failures:
         rows.append(("" if f.step is None else str(f.step.stance), str(f)))
-    table = new_table("skipped stance", "because")
+    table = new_table("skipped stance", "reason")
     for row in rows:
         table.add_row(*row)
     return [table] if rows else []
@@ -311,18 +321,18 @@ def conclude(
         **planned,
     }
     if reached:
-        note = _after_fallback(plan, "the robot made it")
+        note = _after_fallback(plan, "success: the robot reached the goal stance")
     elif not plan.complete:
         note = outcome(plan)
     elif rollout is not None and rollout.stopped:
-        note = f"the robot stopped on the way: {rollout.stopped}"
+        note = f"failed: stopped during execution: {rollout.stopped}"
     else:
         wrong = [n for n, c in criteria.items() if not c.ok]
-        note = f"the robot did not make it ({', '.join(wrong) or 'nothing planned'})"
+        note = f"failed: {', '.join(wrong) or 'nothing was planned'}"
     tables = keyframe_tables(planned) if clock is not None else []
     tables += skipped_tables(plan)
     if rollout is not None and rollout.events:
-        felt = new_table("at [s]", "felt on the way")
+        felt = new_table("at [s]", "measured during execution")
         for e in rollout.events:
             felt.add_row(f"{e.time:.2f}", str(e))
         tables.append(felt)

@@ -18,6 +18,7 @@ import clamber
 from clamber.cli.flags import (
     Place,
     Printed,
+    RobotName,
     RunFolder,
     shown,
 )
@@ -25,6 +26,7 @@ from clamber.cli.output import (
     INTERRUPTED,
     MISSED,
     REACHED,
+    Switch,
     filling,
     new_table,
 )
@@ -40,9 +42,9 @@ class RenderCommand:
 
     run_folder: RunFolder
     """A run folder that holds a plan."""
-    video: bool = False
+    video: Switch = False
     """The video alone: MP4 with clamber[video], else an animated WebP."""
-    sheet: bool = False
+    sheet: Switch = False
     """The sheet of keyframes alone."""
     frame: Annotated[float | None, shown("T")] = None
     """One picture alone, at that time [s]."""
@@ -56,7 +58,7 @@ class RenderCommand:
         ),
     ] = None
     """What is drawn over a frame or a video: contacts, or these with their forces."""
-    transparent: bool = False
+    transparent: Switch = False
     """Robot and obstacles on nothing; with --frame."""
     size: Annotated[str | None, shown("1080p|WxH", "frames 1080p, videos 720p")] = None
     """Of the video, the frame, or each picture of the sheet."""
@@ -279,8 +281,8 @@ class SceneCommand:
 
     file: Annotated[Path, tyro.conf.Positional, shown("FILE")]
     """A scene.yaml, or boxes as OBJ or MJCF."""
-    robot: str = "coman"
-    """Who stands at its start: a built-in robot by name, or a robot.yaml."""
+    robot: RobotName = "coman"
+    """Who stands at its start: a robot by name, or a robot.yaml."""
     out: Annotated[Path | None, shown("DIR")] = None
     """Where to write the picture scene.png."""
     output: Printed
@@ -318,7 +320,8 @@ class RobotCommand:
     action: tyro.conf.Positional[Literal["init", "check"]]
     """init: from an MJCF or URDF. check: a robot.yaml."""
     model: Annotated[str, tyro.conf.Positional, shown("MODEL")]
-    """init: an MJCF or URDF file. check: a robot.yaml, or a built-in robot by name."""
+    """init: an MJCF or URDF, or a humanoid of a wheel (g1, icub, romeo, talos).
+    check: a robot.yaml, or a robot by name."""
     effort: Annotated[Path | None, shown("FILE")] = None
     """init: effort limits the model lacks: YAML {joint: N m}, or another model."""
     out: Annotated[Path | None, shown("DIR", "init: robots/NAME")] = None

@@ -169,7 +169,8 @@ def split_steps(
                 )
             )
         if len(steps) == before:
-            reason = "; ".join(reasons) or "no limb makes or leaves a bearing contact"
+            none = "no limb makes or breaks a load-bearing contact"
+            reason = "; ".join(reasons) or none
             skipped.append(Skipped(stance=i, reason=reason))
     if steps:
         last = [c for c in closed.values() if c is not None]

@@ -29,7 +29,7 @@ class Event:
 class Heavier(Event):
     """The robot's mass is another than described."""
 
-    says = "weighs {factor:.0%} of what its description says"
+    says = "measured mass is {factor:.0%} of the model's"
     factor: float
 
 
@@ -37,7 +37,7 @@ class Heavier(Event):
 class StartsElsewhere(Event):
     """The robot does not stand where it was planned."""
 
-    says = "starts {distance:.3f} m and {yaw:.2f} rad from where it was planned"
+    says = "start pose is off by {distance:.3f} m and {yaw:.2f} rad"
     distance: float
     yaw: float
 
@@ -61,13 +61,13 @@ class ContactMoved(Event):
 
     def __str__(self) -> str:
         """For people."""
-        verb = "touches" if self.made else "is"
+        what = "made contact" if self.made else "is in contact"
         if self.surface != self.planned:
-            return f"{self.surface} {verb} in place of {self.planned}"
+            return f"{self.surface} {what} in place of {self.planned}"
         way = "above" if self.above > 0 else "below"
         return (
-            f"{self.surface} {verb} {abs(self.above):.3f} m {way}, {self.aside:.3f} m"
-            " beside its planned position"
+            f"{self.surface} {what} {abs(self.above):.3f} m {way} and"
+            f" {self.aside:.3f} m beside its planned position"
         )
 
 
@@ -75,7 +75,7 @@ class ContactMoved(Event):
 class Missing(Event):
     """A contact to be made was probed for, `depth` deep, and not found."""
 
-    says = "{surface} finds no support within {depth:.2f} m of its planned position"
+    says = "{surface}: no contact within {depth:.2f} m of its planned position"
     surface: str
     depth: float
 
@@ -84,7 +84,7 @@ class Missing(Event):
 class Lost(Event):
     """A contact of the stance carries no load: it is probed for again."""
 
-    says = "{surface} carries no load: probed for again"
+    says = "{surface}: contact lost (no load), probing to re-establish it"
     surface: str
 
 
@@ -92,7 +92,7 @@ class Lost(Event):
 class GivenUp(Event):
     """A lost contact was probed for in vain: the stance goes on without it."""
 
-    says = "{surface} finds no support: the others carry the robot"
+    says = "{surface}: contact not re-established, continuing on the other contacts"
     surface: str
 
 
@@ -100,7 +100,7 @@ class GivenUp(Event):
 class Unintended(Event):
     """A link carries load on a support where no contact was planned."""
 
-    says = "{link} touches {support} unintendedly: back, and on with extra clearance"
+    says = "unintended contact of {link} with {support}: backing off, more clearance"
     link: str
     support: str
 
@@ -109,7 +109,7 @@ class Unintended(Event):
 class Replanned(Event):
     """What is left was planned again: so many contact changes."""
 
-    says = "replanned, contact changes left: {changes}"
+    says = "replanned: {changes} contact changes remain"
     changes: int
 
 
@@ -117,7 +117,7 @@ class Replanned(Event):
 class KeptPlan(Event):
     """No better plan was found: the one at hand is followed on."""
 
-    says = "goes on as planned ({why})"
+    says = "continuing with the current plan ({why})"
     why: str
 
 
@@ -125,7 +125,7 @@ class KeptPlan(Event):
 class KeptStance(Event):
     """No other plan was found, and none is needed: nothing is left to do."""
 
-    says = "stays in this stance ({why})"
+    says = "holding this stance ({why})"
     why: str
 
 

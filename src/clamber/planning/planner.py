@@ -349,12 +349,15 @@ class _Task:
         """The best of other contacts; else `first`, and what was tried."""
         if isinstance(self._goal, GeneralPolicy):
             return first  # it has its own
-        if self._unsettled or self._search.late:
+        if self._unsettled:
             return first
         reason = f"no stable plan as demonstrated ({first.failures[0]})"
         best = self.ranked(first)[0]
         tried = summary(self._search.attempts)
         if not best.stable:
+            if self._search.late:
+                seconds, n = self._search.budget.seconds, len(self._search.attempts)
+                reason += f"; the {seconds:g} s allowed are spent, {n} steps tried"
             return replace(first, fallback=Fallback(reason=reason, tried=tried))
         fallback = Fallback(
             reason=reason, source=best.source, surfaces=best.surfaces, tried=tried

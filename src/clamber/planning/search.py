@@ -125,9 +125,14 @@ class Search:
         self._end = None if seconds is None else time.monotonic() + seconds
 
     @property
+    def left(self) -> float | None:
+        """Of the budget, in seconds; None where there is no bound."""
+        return None if self._end is None else max(self._end - time.monotonic(), 0.0)
+
+    @property
     def late(self) -> bool:
         """Whether the budget of seconds is spent."""
-        return self._end is not None and time.monotonic() > self._end
+        return self.left == 0.0
 
     def change(
         self,

@@ -399,8 +399,8 @@ class Editor:
         self._replaced(self._new, rollout)
         failed = [n for n, c in verdict.criteria.items() if not c.ok]
         if verdict.reached:
-            return "Physics: the robot made it."
-        return f"Physics: it did not make it ({', '.join(failed)})."
+            return "Physics: success."
+        return f"Physics: failed ({', '.join(failed)})."
 
     def _save(self) -> str:
         assert self._new is not None

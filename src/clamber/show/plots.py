@@ -95,7 +95,7 @@ def _height_figure(
 
 
 def stability_plot(motion: Motion, asked: float, path: str | Path) -> Path:
-    """Projected distances of loaded contacts, the CoM's margin, and guide values.
+    """Projected distances of loaded contacts with guide values, and the CoM's margin.
 
     Args:
         motion: Of physics, or of a plan.
@@ -224,14 +224,14 @@ def _draw_table(ax: Axes, demo: DemoPolicy) -> None:
         action = demo.actions[i]
         weak = {"color": "0.55", "style": "italic"}
         look: dict[str, Any] = {} if i in ruling else weak
-        text = "gives up" if action is None else action
+        text = "breaks contact" if action is None else action
         ax.text(x + 0.5, y + 0.1, text, ha="center", fontsize=6.5, **look)
     rows = math.ceil(len(demo.states) / PER_ROW)
     for k, (region, text) in enumerate(MEANING.items()):
         x, y = 1.6 * k, -0.8 * rows
         ax.add_patch(Circle((x, y), 0.12, fc=COLOURS[region], ec="0.3", lw=0.8))
         ax.text(x + 0.2, y, text, va="center", fontsize=7.5)
-    grey = "grey: another surface of the limb bears the load"
+    grey = "grey: the limb is loaded through another surface"
     ax.text(1.6 * 3, -0.8 * rows, grey, va="center", fontsize=7.5, color="0.45")
     ax.set_xlim(-0.4, PER_ROW - 0.1)
     ax.set_ylim(-0.8 * rows - 0.3, 0.4)

@@ -247,8 +247,8 @@ class Motion:
         push: (n, 3) on the pelvis [N].
         schedule, loads: For each surface from when to when it is planned to bear, and
             bears [s].
-        events: Times at which a contact is made or ends [s]; felt: at which something
-            was felt.
+        events: Times at which a contact is made or ends [s]; felt: of the
+            events of the execution.
 
     An array is None where there is nothing that it could be of.
     """

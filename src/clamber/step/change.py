@@ -199,7 +199,7 @@ def change_contact(
             if isinstance(found, Change):
                 return found
     if failure is None:
-        why = "nothing else bears load"
+        why = "no other contact is loaded"
         return Failure(status=Status.UNBALANCED, step=step, detail=why)
     return failure
 

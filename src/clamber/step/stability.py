@@ -153,9 +153,9 @@ def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
     share, j = needed
     counted = float(torque.limits[j])
     return (
-        f"{Status.OVERLOADED.value}: {torque.names[j]} would have to bear"
-        f" {share * counted:.1f} N m; {counted:.1f} of its"
-        f" {float(kin.world.tau_max[j]):g} are counted on"
+        f"{Status.OVERLOADED.value}: {torque.names[j]} would need"
+        f" {share * counted:.1f} N m; {counted:.1f} N m of its limit of"
+        f" {float(kin.world.tau_max[j]):g} N m are available to the planner"
     )
 
 

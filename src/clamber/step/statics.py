@@ -215,8 +215,8 @@ class StaticEquilibrium:
 
     Attributes:
         feasible: Whether they can: `margin >= 0` but for rounding.
-        margin: The largest horizontal push on the base, in weights, along a line
-            through the centre of mass, that the stance holds in every direction.
+        margin: The push margin: the largest horizontal force on the base [m g], along
+            a line through the centre of mass, that the stance holds in every direction.
             Negative: the least steady push without which it falls; -1 where no push up
             to the weight helps. At most 1.
         limiting: The contact or joint that limits it: in the motion with which the

@@ -64,6 +64,7 @@ class Climb:
         controller: `pid` or `mixed`.
         contacts: `any`: others than the demonstrated ones where those have no stable
             plan; or `demonstrated` only.
+        budget: Of all planning [s]; None: no bound.
         search: How far to search for other contacts.
         disturb: What the planner does not know.
     """
@@ -76,17 +77,22 @@ class Climb:
     speed: float | Literal["max"] = field(default_factory=lambda: PlanOptions().speed)
     controller: ControlMode = DEFAULT_CONTROLLER
     contacts: Contacts = "any"
+    budget: float | None = None
     search: Budget = field(default_factory=Budget)
     disturb: Disturbance = field(default_factory=Disturbance)
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Check that there is one scene.
+        """Check that there is one scene, and one bound.
 
         Raises:
-            InputError: Height and scene, or neither.
+            InputError: Height and scene, or neither; a budget below 0, or two.
         """
+        if self.budget is not None and not self.budget >= 0:
+            raise InputError("0 or more", field="budget", value=self.budget)
+        if self.search.seconds is not None:
+            raise InputError("no bound: that is `budget`", field="search.seconds")
         if (self.height is None) == (self.scene is None):
             raise InputError("height or scene, one of them", field="height")
 
@@ -99,7 +105,7 @@ class ClimbResult:
         reached: The verdict.
         why: What failed first; empty where nothing did.
         seconds: Of motion, until the end or the fall [s]; 0 where there was no plan.
-        replans: How often the rest was planned again on the way.
+        replans: How often the rest was replanned during execution.
         effort: Largest effort of any joint, share of its limit.
     """
 
@@ -113,7 +119,10 @@ class ClimbResult:
 _CLIMB: pydantic.TypeAdapter[Climb] = pydantic.TypeAdapter(Climb)
 GROUPS = {"search": Budget, "disturb": Disturbance}  # flags such as `disturb.mass`
 FLAGS = tuple(f.name for f in fields(Climb) if f.name not in GROUPS) + tuple(
-    f"{group}.{f.name}" for group, kind in GROUPS.items() for f in fields(kind)
+    f"{group}.{f.name}"
+    for group, kind in GROUPS.items()
+    for f in fields(kind)
+    if (group, f.name) != ("search", "seconds")  # that is `budget`
 )
 
 
@@ -244,7 +253,7 @@ def _plan(climb: Climb, folder: Path | None, progress: Progress) -> Plan:
         scene,
         options=PlanOptions(method=climb.method, speed=climb.speed),
         contacts=climb.contacts,
-        budget=climb.search,
+        budget=replace(climb.search, seconds=climb.budget),
         progress=progress,
     )
     if folder is not None:

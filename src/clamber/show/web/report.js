@@ -6,7 +6,7 @@
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const RUNS = DATA.runs;
 const PALETTE = ["#2563eb", "#0891b2", "#c2410c", "#d97706", "#7c3aed", "#db2777", "#15803d", "#65a30d", "#475569", "#b91c1c"];
-const PHASES = { supporting: "#16a34a", "reach-to-supportable": "#eab308", sliding: "#dc2626" };
+const PHASES = { supporting: "#16a34a", "reach-to-supportable": "#eab308", sliding: "#4f46e5" };
 const NONE = -32768;
 
 // An element with attributes, listeners (`onclick`) and children; text is text.
@@ -321,7 +321,7 @@ function gantt(run, motion) {
   return el("div", { class: "gantt" },
     el("div", { class: "names" }, names.map((name) => el("span", {}, name))),
     el("div", {}, strip(motion.end, names.length * row, shapes), timeAxis(motion.end)),
-    el("p", { class: "note" }, `Thin: planned. ${motion.loads ? "Bold: loaded in physics, gaps and touches below 60 ms left out. " : ""}Dashed lines: keyframes.${motion.felt.length ? " Red: something was felt." : ""} Time in s; drag to scrub.`));
+    el("p", { class: "note" }, `Thin: planned. ${motion.loads ? "Bold: loaded in physics, gaps and touches below 60 ms left out. " : ""}Dashed lines: keyframes.${motion.felt.length ? " Red: an event of the execution." : ""} Time in s; drag to scrub.`));
 }
 
 // A plot of lines {name, at: row => number, colour, faint, dashed, bold: row => bool}.
@@ -389,8 +389,8 @@ const PLOTS = [
     if (m.arrays.pushSize) lines.push({ name: "push on the pelvis", colour: "#a21caf", at: (r) => m.arrays.pushSize(r) });
     return { lines, limits: [{ value: m.weight, name: "weight", colour: "#64748b" }], floor: 0, digits: 0 };
   }],
-  ["Projected distance, share of its limit", (run, m) => m.arrays.ratio && {
-    lines: m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => ((m.arrays.loaded || m.arrays.planned)(r, j) > 0 ? m.arrays.ratio(r, j) : NaN) })), limits: [{ value: 1, name: "limit" }], floor: 0 }],
+  ["Projected distance, share of its guide value", (run, m) => m.arrays.ratio && {
+    lines: m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => ((m.arrays.loaded || m.arrays.planned)(r, j) > 0 ? m.arrays.ratio(r, j) : NaN) })), limits: [{ value: 1, name: "guide value", colour: "#64748b" }], floor: 0 }],
   ["Heights of the arms' surfaces [m]; bold: loaded", (run, m) => heights(m, true)],
   ["Heights of the legs' surfaces [m]; bold: loaded", (run, m) => heights(m, false)],
 ];
@@ -434,7 +434,7 @@ function sheet(run, motion, i) {
     const canvas = el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n });
     later(canvas, () => { STILLS.push(canvas); drawStills(); });
     return el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` }, canvas,
-      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, holds a push of ${fixed(k.margin, 2)} weights`, k.time === null && el("em", {}, " — not reached")));
+      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
   };
   const box = el("div", { class: "sheet" });
   return [box, paged(run.keyframes.length, 12, (from, to) => box.replaceChildren(...run.keyframes.slice(from, to).map((k, n) => tile(k, from + n))))];
@@ -481,9 +481,9 @@ function stances(run) {
   const rows = (k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
       el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
-  const made = table(["", "move", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push [weights]", "limit"], [], "stances"), body = made.querySelector("tbody");
+  const made = table(["", "contact change", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push margin [m g]", "limited by"], [], "stances"), body = made.querySelector("tbody");
   const pager = paged(run.keyframes.length, 20, (from, to) => body.replaceChildren(...run.keyframes.slice(from, to).flatMap((k, n) => rows(k, from + n))));
-  const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "because"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
+  const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "reason"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
   return [RUNS.length > 1 && el("h3", {}, run.title), made, pager, ...skipped];
 }
 
@@ -492,9 +492,9 @@ function verdict(run) {
   return table(["criterion", "value", "limit", ""], run.criteria.map((c) => el("tr", { class: c.ok ? "" : "failed" }, cells([c.name, c.value, c.limit, c.ok ? "ok" : "NO"]))), "verdict");
 }
 function events(run, motion) {
-  if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Nothing out of the ordinary was felt.");
+  if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Every contact was measured where it was planned.");
   const time = (t) => (motion && !motion.stills ? t : null);
-  const made = table(["t [s]", "felt on the way"], [], "events"), row = (e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]));
+  const made = table(["t [s]", "measured during execution"], [], "events"), row = (e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]));
   return [made, paged(run.events.length, 40, (from, to) => made.querySelector("tbody").replaceChildren(...run.events.slice(from, to).map(row)))];
 }
 const pairs = (title, rows) => rows.length > 0 && el("div", {}, el("h3", {}, title), table(["", ""], rows.map(([k, v]) => el("tr", {}, cells([k, v]))), "pairs"));
