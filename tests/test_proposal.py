@@ -15,13 +15,7 @@ import humanoids
 from clamber.errors import InputError
 from clamber.model.description import compile_description, read_description
 from clamber.model.kinematics import Kinematics
-from clamber.model.limbs import (
-    Tree,
-    find_limbs,
-    geom_points,
-    geom_volume,
-    joint_range,
-)
+from clamber.model.limbs import find_limbs
 from clamber.model.propose import (
     FOREARM,
     UPPER_ARM,
@@ -31,6 +25,7 @@ from clamber.model.propose import (
 )
 from clamber.model.robot import Robot, load_robot
 from clamber.model.scene import Scene
+from clamber.model.tree import Tree, geom_points, geom_volume, joint_range
 from clamber.model.world import build_world
 from clamber.planning.diagnose import check_robot
 from clamber.run.folder import save_proposal

@@ -91,6 +91,21 @@ _MADE_BY = {  # what there is, what is wanted: what makes the one of the other
 }
 
 
+_KINDS = (
+    (b"version https://git-lfs", "a Git LFS pointer: `git lfs pull` brings the file"),
+    (b"<!doctype html", "an HTML page: download the file itself"),
+    (b"<html", "an HTML page: download the file itself"),
+    (b"PK\x03\x04", "a zip archive: unpack it"),
+    (b"\x1f\x8b", "a gzip archive: unpack it"),
+)
+
+
+def in_its_place(head: bytes) -> str | None:
+    """What a file with these first bytes is that stands in another's place, if so."""
+    start = head.lstrip()[:64].lower() if head[:1].isspace() else head[:64].lower()
+    return next((text for mark, text in _KINDS if start.startswith(mark.lower())), None)
+
+
 class MissingDependency(ClamberError):
     """An optional package is absent."""
 

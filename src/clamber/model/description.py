@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError, unreadable
+from clamber.errors import InputError, in_its_place, unreadable
 from clamber.model.records import short_repr
 from clamber.model.se3 import matrix_from_quat
 
@@ -30,9 +30,11 @@ MESHES = (STL, ".obj", ".msh", COLLADA)
 CLEARLY = 0.5  # times as far, and no farther, are joints from what is theirs
 WATER = 1000.0  # [kg/m^3]
 LEAST_INERTIA = 1e-9  # [kg m^2]
-PACKAGE = "package://"
+PACKAGES = ("package://", "model://")
 SEARCH_PATH = "ROS_PACKAGE_PATH"
 MAX_BYTES = 50_000_000  # of a file
+MAX_FACES = 200_000  # of a mesh that MuJoCo loads
+DETAIL = 2e-3  # [m] nearer corners of what is seen become one
 STL_HEAD, STL_FACE = 84, 50  # [byte] of an STL that is not text
 # What a shape does not need; the rest of a COLLADA file need not be in order.
 _BESIDE = (
@@ -71,7 +73,8 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
     Args:
         path: The file.
         lenient: Mend with a note what would be an error: leave out meshes of unknown
-            formats, give links without a proper inertia a small one.
+            formats and shapes without a size, give links without a proper inertia a
+            small one. What is only seen and is not there is left out in any case.
 
     Raises:
         InputError: It cannot be read, is no such file, or a mesh is missing or broken.
@@ -90,7 +93,6 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
             _keep_all(root)
             text = ElementTree.tostring(root, encoding="unicode")
             spec = mujoco.MjSpec.from_string(text)
-            _take_meshes(spec, notes)
         elif root.tag in ("mujoco", "mujocoinclude"):
             spec = mujoco.MjSpec.from_file(str(path))
             mimics = {
@@ -101,6 +103,10 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
         else:
             expected = "an MJCF (mujoco) or URDF (robot) file"
             raise InputError(expected, path, value=root.tag)
+        _leave_out_looks(spec, path, notes)
+        if lenient:
+            _leave_out_sizeless(spec, notes)
+        _take_meshes(spec, path, notes)
     except ValueError as e:
         raise InputError(f"a model that MuJoCo loads ({_one_line(e)})", path) from e
     return Description(spec=spec, mimics=mimics, notes=tuple(notes))
@@ -140,17 +146,76 @@ def _resolve_meshes(
                 notes.append(f"{where} {name} is left out: no known format")
                 continue
             found = next((p for p in _places(name, path) if p.is_file()), None)
-            if found is None:
+            fault = "is not there" if found is None else _fault(found)
+            if fault and shape.tag == "visual":
+                link.remove(shape)
+                notes.append(f"{where} {name} is left out: it {fault}")
+            elif found is None:
                 hint = f", or its package below {SEARCH_PATH}"
-                expected = "a mesh that is there" + (hint if PACKAGE in name else "")
+                expected = "a mesh that is there" + (hint if "://" in name else "")
                 raise InputError(expected, path, where, name)
-            mesh.set("filename", str(found.resolve()))
+            elif fault:
+                raise InputError(f"a mesh (it {fault})", path, where, name)
+            else:
+                mesh.set("filename", str(found.resolve()))
 
 
-def _take_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
+def _fault(mesh: Path) -> str | None:
+    """Why the file of a mesh cannot be one, if so."""
+    try:
+        with mesh.open("rb") as f:
+            head = f.read(256)
+    except OSError as e:
+        return f"cannot be read ({e.strerror})"
+    if other := in_its_place(head):
+        return f"is {other}"
+    return None if head.strip() else "is empty"
+
+
+def _leave_out_looks(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
+    """Take away textures, and what is only seen where its file is not there."""
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for texture in spec.textures:
+        spec.delete(texture)
+    folder = path.parent / spec.modelfiledir / spec.meshdir
+    for mesh in [m for m in spec.meshes if m.file]:
+        file = folder / mesh.file
+        fault = _fault(file) if file.is_file() else "is not there"
+        shapes = [g for g in spec.geoms if g.meshname == mesh.name]
+        if not fault or any(g.contype or g.conaffinity for g in shapes):
+            if fault and file.is_file():
+                where = f"mesh {mesh.name!r}"
+                raise InputError(f"a mesh (it {fault})", path, where, mesh.file)
+            continue
+        links = ", ".join(dict.fromkeys(repr(g.parent.name) for g in shapes))
+        for g in shapes:
+            spec.delete(g)
+        spec.delete(mesh)
+        who = f"what is seen of {links}" if links else f"mesh {mesh.name!r}"
+        notes.append(f"{who} is left out: {mesh.file} {fault}")
+
+
+def _leave_out_sizeless(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Take away balls, capsules and boxes whose size is 0: marks, no shapes."""
+    kinds = mujoco.mjtGeom
+    needed = {kinds.mjGEOM_BOX: 3, kinds.mjGEOM_ELLIPSOID: 3}
+    solid = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER, *needed)
+    for g in list(spec.geoms):
+        if g.type in solid and not np.all(g.size[: needed.get(g.type, 1)] > 0):
+            notes.append(f"link {g.parent.name!r}: a shape of size 0 is left out")
+            spec.delete(g)
+
+
+def _take_meshes(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     """Put the triangles of files that MuJoCo does not load into the spec."""
-    files = {m.name: Path(m.file) for m in spec.meshes}
-    found = {n: read_mesh(p) for n, p in files.items() if not _is_for_mujoco(p)}
+    folder = path.parent / spec.modelfiledir / spec.meshdir
+    files = {m.name: folder / m.file for m in spec.meshes if m.file}
+    found = {
+        n: read_mesh(p)
+        for n, p in files.items()
+        if p.is_file() and not _is_for_mujoco(p)
+    }
     upright = _fits_upright(spec, found)
     if upright:
         notes.append(
@@ -161,8 +226,33 @@ def _take_meshes(spec: mujoco.MjSpec, notes: list[str]) -> None:
         if mesh.name in found:
             file = found[mesh.name]
             vertices = file.vertices @ file.upright.T if upright else file.vertices
+            triangles = file.triangles
+            if len(triangles) > MAX_FACES:
+                corners = coarser(vertices * mesh.scale, triangles, MAX_FACES)
+                vertices, triangles = np.unique(
+                    corners.reshape(-1, 3) / mesh.scale, axis=0, return_inverse=True
+                )
+                links = {g.parent.name for g in spec.geoms if g.meshname == mesh.name}
+                notes.append(
+                    f"{files[mesh.name].name} of {', '.join(sorted(links))} is coarser:"
+                    f" it has {len(file.triangles)} faces, of which {MAX_FACES} are"
+                    " taken at most"
+                )
             mesh.file = ""
-            mesh.uservert, mesh.userface = vertices.ravel(), file.triangles.ravel()
+            mesh.uservert, mesh.userface = vertices.ravel(), triangles.ravel()
+
+
+def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> np.ndarray:
+    """(F, 3, 3) corners of triangles, on a grid that leaves few enough of them."""
+    step = DETAIL
+    while True:
+        grid = np.round(vertices / step).astype(int)
+        _, which, of = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+        a, b, c = of.reshape(-1)[faces].T
+        kept = faces[(a != b) & (b != c) & (c != a)]
+        if len(kept) <= most:
+            return vertices[which[of.reshape(-1)[kept]]]
+        step *= 2.0
 
 
 def _fits_upright(spec: mujoco.MjSpec, meshes: Mapping[str, MeshFile]) -> bool:
@@ -234,11 +324,11 @@ def _keep_all(root: ElementTree.Element) -> None:
 
 def _places(name: str, path: Path) -> Iterator[Path]:
     """Where a mesh of a URDF may be, the likeliest first."""
-    if not name.startswith(PACKAGE):
-        plain = name.removeprefix("file://")
-        yield path.parent / plain
+    scheme = next((x for x in PACKAGES if name.startswith(x)), None)
+    if scheme is None:
+        yield path.parent / name.removeprefix("file://")
         return
-    rest = name.removeprefix(PACKAGE).lstrip("/")
+    rest = name.removeprefix(scheme).lstrip("/")
     inside = rest.partition("/")[2]
     for folder in path.resolve().parents:
         yield folder / rest
@@ -249,6 +339,9 @@ def _places(name: str, path: Path) -> Iterator[Path]:
             yield Path(folder) / rest
             if Path(folder).name == rest.partition("/")[0]:
                 yield Path(folder) / inside
+    if "/" in inside:  # the folder of the package has another name
+        for folder in path.resolve().parents[:3]:
+            yield folder / inside
 
 
 # Meshes.
@@ -318,9 +411,12 @@ def read_mesh(path: Path) -> MeshFile:
 
 
 def _is_for_mujoco(path: Path) -> bool:
-    """Whether MuJoCo loads a mesh itself: all but COLLADA, and STL in text."""
+    """Whether MuJoCo loads a mesh itself: all but COLLADA, text and large STL."""
     suffix = path.suffix.lower()
-    return suffix != COLLADA and not (suffix == STL and _is_text(path))
+    if suffix == STL:
+        many = path.stat().st_size > STL_HEAD + STL_FACE * MAX_FACES
+        return not many and not _is_text(path)
+    return suffix != COLLADA
 
 
 def _is_text(path: Path) -> bool:

@@ -7,6 +7,7 @@ gains. Everything is to be looked at, and corrected, by the user.
 
 from __future__ import annotations
 
+import copy
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,9 +27,15 @@ from clamber.model.description import (
     compile_description,
     read_description,
 )
-from clamber.model.limbs import Anatomy, Chain, Tree, find_limbs, joint_range
+from clamber.model.facing import said_of_ahead
+from clamber.model.limbs import Anatomy, find_limbs
 from clamber.model.records import short_repr
-from clamber.model.se3 import quat_from_yaw, quat_multiply, rotation_vector
+from clamber.model.se3 import (
+    quat_from_matrix,
+    quat_from_yaw,
+    quat_multiply,
+    rotation_vector,
+)
 from clamber.model.shapes import (
     Shape,
     build_spec,
@@ -37,12 +44,23 @@ from clamber.model.shapes import (
     with_room,
     with_surfaces,
 )
+from clamber.model.tree import Chain, Tree, joint_range
 from clamber.model.wheels import MODELS, how_to_get, model_of
 
 KNEE_BEND = 0.9  # [rad] of the nominal posture, or this share of the range:
 KNEE_SHARE = 0.5
 LESS_BENT = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # ... or less, where an ankle limits it
 LEVEL = 2e-3  # [rad] of soles
+CLEARLY_UPRIGHT = 0.7  # cosine; and by how much more another way is more upright
+# Rotations that bring an axis of a description up.
+_UPS = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-x": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+}
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
 ANKLE_SHARE = 0.5  # of the ankles' effort, at most, that the nominal posture asks for
@@ -170,7 +188,7 @@ def propose_robot(
 
 
 def _upright(description: Description, path: Path) -> tuple[Tree, Anatomy, list[str]]:
-    """The model with a floating base that faces along x at its zero posture."""
+    """The model with a floating base: at zero it is upright and faces along x."""
     spec, notes = description.spec, []
     for i, a in enumerate(spec.actuators):
         a.name = a.name or f"actuator_{i}"
@@ -199,17 +217,64 @@ def _upright(description: Description, path: Path) -> tuple[Tree, Anatomy, list[
                 f"{model.body(b).name} has no inertia in the description: 1 g is taken"
             )
     tree = Tree(model, path, description.mimics)
-    found = find_limbs(tree)
+    tree, found, lay = _stood_up(tree, description.mimics)
+    notes += lay
     x, y = found.forward[:2]
     if x < 1 - 1e-9:
         turn = np.arctan2(-y, x)
-        start = int(model.jnt_qposadr[tree.root])
-        quat = quat_multiply(quat_from_yaw(turn), model.qpos0[start + 3 : start + 7])
-        model.qpos0[start + 3 : start + 7] = model.body_quat[found.base] = quat
-        notes.append(f"turned by {np.degrees(turn):.0f} degrees to face along x")
-        tree = Tree(model, path, description.mimics)
+        tree = _turned(tree, quat_from_yaw(turn), description.mimics)
         found = find_limbs(tree)
-    return tree, found, notes
+        notes.append(f"turned by {np.degrees(turn):.0f} degrees to face along x")
+    return tree, found, notes + said_of_ahead(found.signs)
+
+
+def _stood_up(tree: Tree, mimics: Mapping[str, str]) -> tuple[Tree, Anatomy, list[str]]:
+    """The description upright: where its z is not up, whichever axis is.
+
+    Shoulders are over hips and hips over feet. As it is, it stays where it is upright,
+    or no other way is clearly better.
+    """
+    error, best = None, None
+    for name, R in _UPS.items():
+        turned = tree if name == "z" else _turned(tree, quat_from_matrix(R), mimics)
+        try:
+            found = find_limbs(turned)
+        except InputError as e:
+            error = error or e
+            continue
+        upright = _uprightness(turned, found)
+        if best is None or upright > best[0] + CLEARLY_UPRIGHT:
+            best = (upright, name, turned, found)
+        if name == "z" and upright > CLEARLY_UPRIGHT:
+            break
+    if best is None:
+        assert error is not None
+        raise error
+    _, name, tree, found = best
+    note = f"upright is {name} in the description: it is stood up"
+    return tree, found, [] if name == "z" else [note]
+
+
+def _uprightness(tree: Tree, found: Anatomy) -> float:
+    """From -1, upside down, to 1, where shoulders are over hips and hips over feet."""
+    at, out = tree.data.xanchor, 1.0
+    shoulders, hips = (
+        np.mean([at[c.joints[0]] for c in found.pair(kind)], axis=0)
+        for kind in ("arm", "leg")
+    )
+    feet = np.mean([tree.far(c) for c in found.pair("leg")], axis=0)
+    for up in (shoulders - hips, hips - feet):
+        out = min(out, float(up[2]) / max(float(np.linalg.norm(up)), 1e-9))
+    return out
+
+
+def _turned(tree: Tree, quat: np.ndarray, mimics: Mapping[str, str]) -> Tree:
+    """The tree of the same model with its base turned in the world."""
+    model = copy.copy(tree.model)
+    start, base = int(model.jnt_qposadr[tree.root]), tree.base
+    turned = quat_multiply(quat, model.qpos0[start + 3 : start + 7])
+    model.qpos0[start + 3 : start + 7] = model.body_quat[base] = turned
+    return Tree(model, tree.source, mimics)
 
 
 def _release(spec: mujoco.MjSpec, base: mujoco.MjsBody, path: Path) -> str:

@@ -24,23 +24,18 @@ from scipy.optimize import brentq
 from scipy.spatial import ConvexHull, QhullError
 
 from clamber.errors import InputError
-from clamber.model.description import MESHES
-from clamber.model.limbs import (
-    DENSEST,
-    Anatomy,
-    Chain,
-    Tree,
-    geom_points,
-    geom_volume,
-)
+from clamber.model.description import MESHES, coarser
+from clamber.model.facing import sole_points
+from clamber.model.limbs import DENSEST, Anatomy
 from clamber.model.records import short_repr
 from clamber.model.se3 import quat_from_matrix
+from clamber.model.tree import Chain, Tree, geom_points, geom_volume
 
 HEAVY = 1.0  # [kg] a link this heavy without collision shape gets one
 PAD = 0.006  # [m] balls stand out of their links: the link does not touch before them
 FLAT = 0.4  # a mesh flatter than this share of its width becomes a box
-SOLE_DEPTH = 0.04  # share of the shank: points this near to the lowest are the sole
 NEAR = 0.05  # share of thigh or upper arm: as far past the joint its ball holds all
+FOREARM = 0.4  # share of the upper arm: shapes that reach less far are no forearm
 LEAST_BALL, LARGEST_BALL = 0.12, 0.3  # ... radius at knee and elbow
 TOUCHING = 0.02  # [m] links two joints apart that are nearer are not kept apart
 ROOM = 0.01  # [m] around links as the robot stands
@@ -48,7 +43,6 @@ THINNER = 0.2  # share of its size
 ROUNDING = 2e-5  # share of a moment of inertia that is lost where it is written
 MESH_FOLDER = "meshes"  # beside the model
 MAX_FACES = 50_000  # of a mesh; MuJoCo loads four times as many
-DETAIL = 2e-3  # [m] nearer corners of what is seen become one
 SEEN, HIDDEN = 2, 3  # groups of geoms that MuJoCo's viewer shows, and does not
 SHELL, ORANGE = (0.82, 0.84, 0.86, 1.0), (0.93, 0.45, 0.13, 1.0)  # links, surfaces
 _KINDS = {
@@ -204,7 +198,7 @@ def with_surfaces(
             own = [_hand(tree, outer, chain, shapes)]
         else:
             own = [_sole(tree, outer, chain)]
-            shapes = [s for s in shapes if s.link != end]
+            shapes = [s for s in shapes if not tree.hangs_on(s.link, end)]
         own.append(_joint_ball(tree, inner, chain, shapes))
         prefix = {end: outer, middle: inner}
         shapes = [
@@ -253,8 +247,9 @@ def _hand(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape
     end, elbow = int(tree.links[chain.end]), tree.data.xanchor[chain.elbow]
     hand = {b for b in tree.links.tolist() if tree.hangs_on(b, end)}
     points = _points_of(shapes, hand)
-    if len(points) == 0:
-        points = tree.data.xipos[end][None]
+    length = float(np.linalg.norm(tree.data.xpos[chain.root] - elbow))
+    if np.linalg.norm(points - elbow, axis=1).max(initial=0.0) < FOREARM * length:
+        points = (2 * tree.data.xipos[end] - elbow)[None]  # its mass is half as far
     away = np.linalg.norm(points - elbow, axis=1)
     length = float(away.max())
     u = (points[int(np.argmax(away))] - elbow) / length
@@ -312,10 +307,8 @@ def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
         expected = f"geometry, meshes of {', '.join(MESHES)} included, for its sole"
         raise InputError(expected, tree.source, where)
     low = float(points[:, 2].min())
-    shank = float(tree.data.xanchor[chain.elbow][2] - low)
-    sole = points[points[:, 2] < low + SOLE_DEPTH * shank, :2]
     try:
-        (x0, x1), (y0, y1) = _largest_rectangle(sole)
+        (x0, x1), (y0, y1) = _largest_rectangle(sole_points(tree, chain)[:, :2])
     except QhullError as e:
         expected = "a sole with an area, level at the zero posture"
         raise InputError(expected, tree.source, where) from e
@@ -568,23 +561,10 @@ def _add_mesh(
         first, n = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
         begin, m = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
         corners = model.mesh_vert[first : first + n], model.mesh_face[begin : begin + m]
-        files[file] = _stl(_coarser(*corners))
+        files[file] = _stl(coarser(*corners, MAX_FACES))
         added = spec.add_mesh(name=name, file=file)
         added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # may be open
     return name
-
-
-def _coarser(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F, 3, 3) corners of triangles, on a grid that leaves few enough of them."""
-    step = DETAIL
-    while True:
-        grid = np.round(vertices / step).astype(int)
-        _, which, of = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-        a, b, c = of.reshape(-1)[faces].T
-        kept = faces[(a != b) & (b != c) & (c != a)]
-        if len(kept) <= MAX_FACES:
-            return vertices[which[of.reshape(-1)[kept]]]
-        step *= 2.0
 
 
 def _stl(corners: np.ndarray) -> bytes:

@@ -9,12 +9,14 @@ import numpy as np
 
 from clamber.errors import InputError
 from clamber.model.arguments import checks_types
+from clamber.model.facing import sides_told
 from clamber.model.kinematics import Kinematics, limb_lengths
-from clamber.model.limbs import DENSEST, geom_volume
+from clamber.model.limbs import DENSEST
 from clamber.model.records import short_repr
 from clamber.model.robot import RobotLike, load_robot
 from clamber.model.scene import Box, Scene
 from clamber.model.terrain import SceneLike, load_scene
+from clamber.model.tree import geom_volume
 from clamber.model.world import World, build_world
 from clamber.step.change import standing
 from clamber.step.ik import IK
@@ -25,6 +27,8 @@ from clamber.step.stability import limiting_joint
 LEVEL = np.radians(2.0)  # soles as the robot stands
 SAME_HEIGHT = 0.005  # [m] of both soles
 STRAIGHT = np.radians(10.0)  # a limb bent by less is straight
+BENT_BACK = 0.02  # share of the leg: a knee that is so far behind bends backward
+POINTS_BACK = 0.3  # share of a sole: as much longer behind the ankle than ahead
 HEAVY = 1.0  # [kg] a link this heavy needs collision geometry
 UNLIKE = 0.02  # share by which the lengths of left and right limbs may differ
 
@@ -124,12 +128,48 @@ def _limb_faults(world: World, kin: Kinematics, lengths: dict[str, float]) -> li
         left, right = lengths[f"left_{kind}"], lengths[f"right_{kind}"]
         if abs(left - right) > UNLIKE * max(left, right):
             out.append(f"the {kind}s are {left:.3f} m and {right:.3f} m long")
+    out += _ahead_faults(world, kin)
     left, right = (
         kin.landmark(world.robot.limbs[f"{side}_leg"].root)[1]
         for side in ("left", "right")
     )
     if left[1] <= right[1]:
         out.append("the left leg is not on the left: x is forward, y left")
+    return out
+
+
+def _ahead_faults(world: World, kin: Kinematics) -> list[str]:
+    """Knees bent backward, feet that point back, crossed arms, sides swapped."""
+    out, limbs = [], world.robot.limbs
+    for limb in (x for x in limbs.values() if not x.is_arm):
+        a, b, c = (kin.landmark(n)[1] for n in (limb.root, limb.middle, limb.end))
+        on, off = c - a, b - a
+        behind = float((off @ on / (on @ on) * on - off)[0])
+        if behind > BENT_BACK * float(np.linalg.norm(on)):
+            out.append(
+                f"limbs.{limb.name}: its knee is {1e3 * behind:.0f} mm behind the line"
+                " from hip to ankle: it bends backward"
+            )
+        name = limb.surfaces[0]
+        along = kin.bearing_points(name, np.array([0.0, 0.0, 1.0]))[:, 0] - c[0]
+        ahead, back = float(along.max()), -float(along.min())
+        if back - ahead > POINTS_BACK * (ahead + back):
+            out.append(
+                f"{name} points back: it reaches {1e3 * back:.0f} mm behind its ankle"
+                f" and {1e3 * ahead:.0f} mm ahead"
+            )
+    for kind in ("arm", "leg"):
+        left, right = limbs[f"left_{kind}"], limbs[f"right_{kind}"]
+        names = [(getattr(left, x), getattr(right, x)) for x in ("root", "middle")]
+        if sides_told(names) < 0:
+            a, b = names[0]
+            out.append(
+                f"left and right are swapped: limbs.left_{kind} is that of {a}, and"
+                f" limbs.right_{kind} that of {b}"
+            )
+    hands = [kin.landmark(limbs[f"{s}_arm"].end)[1] for s in ("left", "right")]
+    if hands[0][1] <= hands[1][1]:
+        out.append("the arms cross as it stands: the left hand is right of the other")
     return out
 
 
