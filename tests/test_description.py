@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 
@@ -52,16 +53,94 @@ def test_a_package_mesh_is_found_in_the_search_path(tmp_path, monkeypatch):
     (tmp_path / "elsewhere" / "pack").mkdir(parents=True)
     (tmp_path / "elsewhere" / "pack" / "t.stl").write_bytes(stl(CUBE))
     path = written(tmp_path, humanoids.urdf(mesh="package://pack/t.stl"))
-    with pytest.raises(InputError, match=r"t\.stl"):
-        read_description(path)
+    assert compile_description(read_description(path), path).nmesh == 0
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(tmp_path / "elsewhere"))
     assert compile_description(read_description(path), path).nmesh == 1
 
 
-def test_a_missing_mesh_is_named_with_its_link(tmp_path):
-    path = written(tmp_path, humanoids.urdf(mesh="package://pack/gone.stl"))
-    with pytest.raises(InputError, match=r"'k2'.*gone\.stl.*ROS_PACKAGE_PATH"):
-        read_description(path)
+def collision(text: str) -> str:
+    """The drawn mesh as a collision shape."""
+    return text.replace("<visual>", "<collision>").replace("</visual>", "</collision>")
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "word"),
+    [
+        ("package://pack/gone.stl", None, "not there"),
+        ("file:///nowhere/gone.stl", None, "not there"),
+        ("gone.stl", LFS, "Git LFS pointer"),
+        ("gone.stl", b"<!DOCTYPE html><html>", "HTML page"),
+        ("gone.stl", b"PK\x03\x04....", "zip archive"),
+        ("gone.stl", b"", "empty"),
+    ],
+)
+def test_what_is_only_seen_may_be_missing_and_a_collision_mesh_may_not(
+    tmp_path, name, content, word
+):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    path = written(tmp_path, humanoids.urdf(mesh=name))
+    (note,) = read_description(path).notes
+    assert re.search(rf"'k2'.*gone\.stl.*{word}", note)
+    path = written(tmp_path, collision(humanoids.urdf(mesh=name)))
+    with pytest.raises(InputError, match=r"'k2'.*gone\.stl"):
+        read_description(path, lenient=True)
+
+
+@pytest.mark.parametrize("solid", [False, True])
+def test_the_same_holds_for_meshes_and_textures_of_an_mjcf(tmp_path, solid):
+    shape = '<geom type="mesh" mesh="shell" material="skin" group="2"'
+    shape += "/>" if solid else ' contype="0" conaffinity="0"/>'
+    assets = (
+        '<asset><texture name="grain" type="2d" file="gone.png"/>'
+        '<material name="skin" texture="grain" rgba="1 0 0 1"/>'
+        '<mesh name="shell" file="gone.stl"/></asset>'
+    )
+    text = humanoids.mjcf().replace("<worldbody>", assets + "<worldbody>")
+    text = text.replace('<body name="h"', shape + '<body name="h"')
+    path = written(tmp_path, text, "robot.xml")
+    if solid:
+        with pytest.raises(InputError, match=r"'b1'.*gone\.stl.*not there"):
+            read_description(path, lenient=True)
+    else:
+        (note,) = (found := read_description(path, lenient=True)).notes
+        assert re.search(r"'b1'.*gone\.stl is not there", note)
+        assert compile_description(found, path).nmesh == 0
+
+
+def test_a_shape_without_a_size_is_a_mark_and_no_shape(tmp_path):
+    mark = '<collision><geometry><sphere radius="0"/></geometry></collision>'
+    text = humanoids.urdf().replace("</link>", mark + "</link>", 1)
+    path = written(tmp_path, text)
+    found = read_description(path, lenient=True)
+    assert any("'k0'" in n and "size 0" in n for n in found.notes)
+    solid = compile_description(found, path)
+    plain = written(tmp_path, humanoids.urdf(), "plain.urdf")
+    assert solid.ngeom == compile_description(read_description(plain), plain).ngeom
+
+
+def test_a_mesh_of_more_faces_than_mujoco_loads_becomes_coarser(tmp_path):
+    n = 330  # on each side: 217 800 faces of a warped sheet
+    x, y = np.meshgrid(np.linspace(0, 0.4, n + 1), np.linspace(0, 0.4, n + 1))
+    p = np.stack([x, y, 0.1 * np.sin(9 * x) * y], axis=-1)
+    a, b, c, d = p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]
+    corners = np.stack([[a, b, c], [a, c, d]]).transpose(0, 2, 3, 1, 4)
+    face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    faces = np.zeros(2 * n * n, dtype=face)
+    faces["corners"] = corners.reshape(-1, 3, 3)
+    head = bytes(80) + np.uint32(len(faces)).tobytes()
+    (tmp_path / "t.stl").write_bytes(head + faces.tobytes())
+    path = written(tmp_path, humanoids.urdf(mesh="t.stl"))
+    found = read_description(path)
+    (note,) = found.notes
+    assert re.search(r"t\.stl of k2.*217800 faces", note)
+    model = compile_description(found, path)
+    assert 1000 < model.mesh_facenum[0] <= 200_000
+    away = np.linalg.norm(model.mesh_vert - model.mesh_vert.mean(axis=0), axis=1).max()
+    assert away == pytest.approx(0.2 * np.sqrt(2), abs=0.02)
 
 
 def test_a_mesh_of_another_format_is_refused_or_left_out_with_a_note(tmp_path):

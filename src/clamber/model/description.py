@@ -178,22 +178,28 @@ def _leave_out_looks(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
         material.textures = [""] * len(material.textures)
     for texture in spec.textures:
         spec.delete(texture)
-    folder = path.parent / spec.modelfiledir / spec.meshdir
     for mesh in [m for m in spec.meshes if m.file]:
-        file = folder / mesh.file
-        fault = _fault(file) if file.is_file() else "is not there"
-        shapes = [g for g in spec.geoms if g.meshname == mesh.name]
-        if not fault or any(g.contype or g.conaffinity for g in shapes):
-            if fault and file.is_file():
-                where = f"mesh {mesh.name!r}"
-                raise InputError(f"a mesh (it {fault})", path, where, mesh.file)
+        file = _mesh_path(spec, mesh, path)
+        fault = "is not there" if file is None else _fault(file)
+        if not fault:
             continue
+        shapes = [g for g in spec.geoms if g.meshname == mesh.name]
         links = ", ".join(dict.fromkeys(repr(g.parent.name) for g in shapes))
+        if any(g.contype or g.conaffinity for g in shapes):
+            where = f"link {links}: collision mesh"
+            raise InputError(f"a mesh (it {fault})", path, where, mesh.file)
         for g in shapes:
             spec.delete(g)
         spec.delete(mesh)
         who = f"what is seen of {links}" if links else f"mesh {mesh.name!r}"
         notes.append(f"{who} is left out: {mesh.file} {fault}")
+
+
+def _mesh_path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path) -> Path | None:
+    """Where the file of a mesh is, as MuJoCo looks for it; None where it is not."""
+    name = Path(mesh.file)
+    places = [path.parent / spec.meshdir / name, path.parent / spec.meshdir / name.name]
+    return next((p for p in [*places, path.parent / name] if p.is_file()), None)
 
 
 def _leave_out_sizeless(spec: mujoco.MjSpec, notes: list[str]) -> None:
@@ -209,13 +215,9 @@ def _leave_out_sizeless(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 def _take_meshes(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     """Put the triangles of files that MuJoCo does not load into the spec."""
-    folder = path.parent / spec.modelfiledir / spec.meshdir
-    files = {m.name: folder / m.file for m in spec.meshes if m.file}
-    found = {
-        n: read_mesh(p)
-        for n, p in files.items()
-        if p.is_file() and not _is_for_mujoco(p)
-    }
+    places = {m.name: _mesh_path(spec, m, path) for m in spec.meshes if m.file}
+    files = {n: p for n, p in places.items() if p and not _is_for_mujoco(p)}
+    found = {n: read_mesh(p) for n, p in files.items()}
     upright = _fits_upright(spec, found)
     if upright:
         notes.append(

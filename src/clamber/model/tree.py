@@ -96,12 +96,12 @@ class Tree:
             for j in range(model.njnt)
             if model.joint(j).name not in coupled
         ]
-        ties = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+        ties = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+        site = int(mujoco.mjtObj.mjOBJ_SITE)
         self._tied = {
-            int(model.site_bodyid[x]) if on_sites else int(x)
+            int(model.site_bodyid[x] if model.eq_objtype[e] == site else x)
             for e in range(model.neq)
-            if model.eq_type[e] in ties
-            for on_sites in (model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE,)
+            if int(model.eq_type[e]) in ties
             for x in (model.eq_obj1id[e], model.eq_obj2id[e])
             if x > 0
         }
