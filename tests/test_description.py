@@ -13,6 +13,7 @@ import pytest
 import humanoids
 from clamber.errors import InputError
 from clamber.model.description import compile_description, read_description
+from clamber.model.robot import load_robot
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.1
 
@@ -181,6 +182,26 @@ def test_what_is_no_description_is_refused_in_one_sentence(tmp_path, content, wo
         read_description(path)
     assert str(path) in str(e.value)
     assert "\n" not in str(e.value)
+
+
+def test_a_file_that_stands_in_anothers_place_is_told(tmp_path):
+    for content, word in (
+        (LFS, "Git LFS"),
+        (b"<!DOCTYPE html>", "HTML"),
+        (b"PK\3\4", "zip"),
+    ):
+        (tmp_path / "robot.urdf").write_bytes(content)
+        with pytest.raises(InputError, match=word):
+            read_description(tmp_path / "robot.urdf")
+    (tmp_path / "robot.yaml").write_bytes(LFS)
+    with pytest.raises(InputError, match="Git LFS"):
+        load_robot(tmp_path / "robot.yaml")
+
+
+def test_macros_of_xacro_are_asked_to_be_expanded(tmp_path):
+    text = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:leg/></robot>'
+    with pytest.raises(InputError, match="expand the macros"):
+        read_description(written(tmp_path, text))
 
 
 def test_a_document_in_another_encoding_hides_nothing(tmp_path):

@@ -145,7 +145,10 @@ def read_yaml(path: Path) -> dict:
     import yaml  # slow to import, as pydantic below: who catches errors needs neither
 
     try:
-        content = yaml.safe_load(path.read_text())
+        text = path.read_text()
+        if other := in_its_place(text[:256].encode()):
+            raise InputError(f"YAML (it is {other})", path)
+        content = yaml.safe_load(text)
     except OSError as e:
         raise unreadable(path, e) from e
     except (yaml.YAMLError, UnicodeDecodeError) as e:

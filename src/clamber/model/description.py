@@ -83,6 +83,9 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
     notes: list[str] = []
     try:
         if root.tag == "robot":
+            if any("wiki/xacro}" in e.tag for e in root.iter()):
+                expected = "a URDF: expand the macros with `xacro FILE > FILE.urdf`"
+                raise InputError(expected, path)
             mimics = {
                 str(j.get("name")): str(m.get("joint"))
                 for j in root.findall("joint")
@@ -506,6 +509,8 @@ def read_xml(path: Path) -> ElementTree.Element:
         InputError: It is no such file, or too large.
     """
     content = _read_content(path)
+    if other := in_its_place(content[:256]):
+        raise InputError(f"XML (it is {other})", path)
     if b"\0" in content:  # UTF-16 would hide what is looked for next
         raise InputError("XML in UTF-8", path)
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
