@@ -277,7 +277,7 @@ def main() -> None:
     rows, table = [], args.out / "gauntlet.csv"
     if table.exists():
         with table.open(newline="") as f:
-            rows = [Row(**r) for r in csv.DictReader(f)]
+            rows = [Row(**r) for r in csv.DictReader(f)]  # pyright: ignore
     done = {r.file for r in rows}
     for path in humanoids_and_recordings(args.paths):
         if str(path) in done:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import humanoids
+from clamber.errors import InputError
 from clamber.model.facing import side_told
 from clamber.model.propose import Proposal, propose_robot
 from clamber.model.robot import Robot, load_robot
@@ -176,3 +177,41 @@ def test_a_forearm_whose_only_shape_is_a_ball_on_its_joint_is_bent(tmp_path):
     assert check_robot(robot).faults == ()
     model = mujoco.MjModel.from_xml_path(str(robot.path))
     assert model.geom("LHand").pos[2] < -0.15
+
+
+def test_a_collarbone_is_no_elbow(tmp_path):
+    text = humanoids.mjcf()
+    for tag, x, out in (("v", -0.17, -1), ("w", 0.17, 1)):
+        bone = (
+            f'<body name="{tag}0" pos="{x - 0.12 * out} 0 0.2">'
+            f'<joint name="{tag}0" axis="0 1 0" range="-0.3 0.3"'
+            ' actuatorfrcrange="-50 50"/>'
+            '<geom type="sphere" size="0.02" mass="0.3"/>'
+        )
+        start = text.index(f'<body name="{tag}1"')
+        end = text.index("</body>", text.index("</body>", start) + 1) + len("</body>")
+        arm = text[start:end].replace(f'pos="{x} 0 0.2"', f'pos="{0.12 * out} 0 0"')
+        text = text[:start] + bone + arm + "</body>" + text[end:]
+    _, robot = proposed(tmp_path, text)
+    assert limb_bodies(robot) == AS_IT_IS
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_knee_driven_by_a_motor_beside_it_is_a_joint_of_its_own(tmp_path, beside):
+    text, ties = humanoids.mjcf(), ""
+    for tag in "tu":
+        motor = (
+            f'<body name="{tag}m"><joint name="{tag}m" axis="1 0 0"/>'
+            '<geom type="sphere" size="0.01" mass="0.1"/></body>'
+        )
+        at = text.index(f'<body name="{tag}2"')
+        text = text[:at] + motor + text[at:]
+        ties += f'<joint joint1="{tag}d" joint2="{tag}{"m" if beside else "c"}"/>'
+    text = text.replace("</mujoco>", f"<equality>{ties}</equality></mujoco>")
+    if beside:
+        made, robot = proposed(tmp_path, text)
+        assert limb_bodies(robot) == AS_IT_IS
+        assert any("td (by tm)" in n for n in made.notes)
+    else:
+        with pytest.raises(InputError, match="'td'.*follows 'tc'"):
+            proposed(tmp_path, text)

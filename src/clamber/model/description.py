@@ -116,13 +116,21 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
 
 
 def compile_description(description: Description, path: Path) -> mujoco.MjModel:
-    """Compile.
+    """Compile; meshes without a volume, or not closed, count as shells.
 
     Raises:
         InputError: MuJoCo's reason, such as a mesh that is missing.
     """
+    spec = description.spec
     try:
-        return description.spec.compile()
+        try:
+            return spec.compile()
+        except ValueError as e:
+            if "mesh" not in str(e) or "inertia" not in str(e):
+                raise
+            for mesh in spec.meshes:
+                mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            return spec.compile()
     except ValueError as e:
         raise InputError(f"a model that MuJoCo loads ({_one_line(e)})", path) from e
 

@@ -241,7 +241,8 @@ def _bending(tree: Tree, joints: list[int], end: int) -> tuple[int, float]:
     def lever(j: int, p: np.ndarray) -> float:
         return float(np.linalg.norm(np.cross(p - data.xanchor[j], data.xaxis[j])))
 
-    bend = int(np.argmax([lever(j, first) * lever(j, tip) for j in joints]))
+    # What is before the middle of the shoulder is a collarbone.
+    bend = 2 + int(np.argmax([lever(j, first) * lever(j, tip) for j in joints[2:]]))
     local = data.xmat[end].reshape(3, 3).T @ (tip - data.xpos[end])
     angles = np.linspace(*joint_range(model, joints[bend]), SWEEP)
     lengths = []

@@ -125,11 +125,7 @@ def propose_robot(
     path = Path(path)
     description = read_description(path, lenient=True)
     tree, found, notes = _upright(description, path)
-    for j in found.moving:
-        if other := description.mimics.get(tree.name(j)):
-            expected = "joints of limbs and trunk that move on their own"
-            where = f"joint {tree.name(j)!r}"
-            raise InputError(f"{expected} (it follows {other!r})", path, where)
+    notes += _driven(tree, found, description.mimics, path)
     shapes, more = link_shapes(tree)
     notes += more
     shapes, limbs = with_surfaces(tree, found, shapes)
@@ -275,6 +271,27 @@ def _turned(tree: Tree, quat: np.ndarray, mimics: Mapping[str, str]) -> Tree:
     turned = quat_multiply(quat, model.qpos0[start + 3 : start + 7])
     model.qpos0[start + 3 : start + 7] = model.body_quat[base] = turned
     return Tree(model, tree.source, mimics)
+
+
+def _driven(
+    tree: Tree, found: Anatomy, mimics: Mapping[str, str], path: Path
+) -> list[str]:
+    """A note on joints of limbs that motors beside them drive: gears, rods, belts.
+
+    Raises:
+        InputError: One follows another that moves a limb, too.
+    """
+    names = [tree.name(j) for j in found.moving]
+    driven = {n: mimics[n] for n in names if n in mimics}
+    for name, other in driven.items():
+        if other in names:
+            expected = "joints of limbs and trunk that move on their own"
+            where = f"joint {name!r}"
+            raise InputError(f"{expected} (it follows {other!r})", path, where)
+    if not driven:
+        return []
+    said = ", ".join(f"{n} (by {other})" for n, other in driven.items())
+    return [f"driven by a motor beside the limb, taken as joints of their own: {said}"]
 
 
 def _release(spec: mujoco.MjSpec, base: mujoco.MjsBody, path: Path) -> str:
