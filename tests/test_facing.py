@@ -213,5 +213,5 @@ def test_a_knee_driven_by_a_motor_beside_it_is_a_joint_of_its_own(tmp_path, besi
         assert limb_bodies(robot) == AS_IT_IS
         assert any("td (by tm)" in n for n in made.notes)
     else:
-        with pytest.raises(InputError, match="'td'.*follows 'tc'"):
+        with pytest.raises(InputError, match=r"'td'.*follows 'tc'"):
             proposed(tmp_path, text)
