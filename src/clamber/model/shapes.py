@@ -247,9 +247,15 @@ def _hand(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape
     end, elbow = int(tree.links[chain.end]), tree.data.xanchor[chain.elbow]
     hand = {b for b in tree.links.tolist() if tree.hangs_on(b, end)}
     points = _points_of(shapes, hand)
-    length = float(np.linalg.norm(tree.data.xpos[chain.root] - elbow))
-    if np.linalg.norm(points - elbow, axis=1).max(initial=0.0) < FOREARM * length:
-        points = (2 * tree.data.xipos[end] - elbow)[None]  # its mass is half as far
+    least = FOREARM * float(np.linalg.norm(tree.data.xpos[chain.root] - elbow))
+    centre = tree.data.xipos[end]
+    alone = end == int(tree.links[chain.middle])  # a forearm: its mass is halfway out
+    for other in (
+        tree.points(end, below=True),
+        (centre + alone * (centre - elbow))[None],
+    ):
+        if np.linalg.norm(points - elbow, axis=1).max(initial=0.0) < least:
+            points = other
     away = np.linalg.norm(points - elbow, axis=1)
     length = float(away.max())
     u = (points[int(np.argmax(away))] - elbow) / length
