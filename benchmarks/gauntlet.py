@@ -263,7 +263,7 @@ def write_tables(rows: list[Row], folder: Path) -> None:
 
 def main() -> None:
     """One row for each file."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("paths", type=Path, nargs="*", help="files, or folders of them")
     parser.add_argument("--out", type=Path, required=True, help="for tables and runs")
     parser.add_argument("--fetch", type=Path, metavar="DIR", help="bring wheels there")
