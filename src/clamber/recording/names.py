@@ -192,7 +192,8 @@ def prefixes_of(names: Sequence[str]) -> list[str]:
     few = len(often) - int(_MOST * len(often))  # others, at most, on either side
     for k in range(few + 1 if len(often) >= _MANY else 0):
         shared = _shared(often[k], often[-1 - few + k])
-        if len(shared) > 2 and shared not in count:
+        longest = max((len(p) for p in count if shared.startswith(p)), default=0)
+        if len(shared) > longest + 2:
             out.append(shared)
     return ["", *sorted(dict.fromkeys(out), key=lambda p: (-len(p), p))]
 
@@ -276,5 +277,5 @@ def _sided(pieces: Sequence[str]) -> list[tuple[str, str]]:
 
 _WORDS = {
     *(w for words in JOINTS.values() for w in words),
-    *(w for place in PLACES.values() for several in place for w in several),
+    *(w.lstrip("*") for place in PLACES.values() for both in place for w in both),
 }

@@ -121,7 +121,7 @@ def recognise(
         lacking, found = min(incomplete, key=lambda x: len(x[0]))
         taken = {c for columns in found.columns.values() for c in columns}
         left = [n for i, n in enumerate(names) if i not in taken]
-        over = f"left over are {_listed(left)}" if left else "no name is left over"
+        over = f"left over are {_listed(left, 24)}" if left else "no name is left over"
         expected = (
             f"a joint or markers for {', '.join(lacking)}: name them under `parts` of "
             f"a recording.yaml; {over}"
@@ -206,9 +206,9 @@ def _places(said: Mapping[str, Mapping[str, int]]) -> dict[str, tuple[int, ...]]
     return columns
 
 
-def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:12])
-    return shown if len(names) <= 12 else f"{shown} ... ({len(names)})"
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} ... ({len(names)})"
 
 
 # Joint centres.
