@@ -23,7 +23,7 @@ def sided(words: str, form: str) -> list[str]:
     ]
 
 
-# What is recognised, its form, the words of ORDER, then others of each side and of none.
+# What is recognised, the form, the words of ORDER, others of each side, of no side.
 SKELETONS = {
     "Unreal": (
         "Unreal skeleton", "{w}_{d}", "thigh calf foot upperarm lowerarm hand",

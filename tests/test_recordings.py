@@ -20,10 +20,9 @@ from clamber.recording.bvh import read_bvh
 from clamber.recording.demonstration import (
     Demonstration,
     estimate_offsets,
-    find_levels,
-    fit_levels,
 )
 from clamber.recording.detect import SEAT, detect_contacts
+from clamber.recording.levels import find_levels, fit_levels
 from clamber.recording.points import unique_names
 from clamber.recording.recording import load_demo, read_points
 from clamber.recording.skeleton import recognise, solve_centres

@@ -116,6 +116,83 @@ class Status(enum.Enum):
     BUDGET = "the budget of tries or seconds was spent: allow more"
 
 
+# What a file may be in place of what its name says: how it begins, what that is, and
+# what to do then. The short names are for those who read such files.
+_UNPACK, _SAVE = "unpack it first", "save positions, names and rate as .npz"
+_KINDS: tuple[tuple[str, bytes, str, str], ...] = (
+    ("", b"version https://git-lfs", "a Git LFS pointer", "`git lfs pull` fetches it"),
+    ("", b"/annex/objects/", "a git-annex pointer", "`git annex get` fetches it"),
+    ("", b"<!doctype html", "a web page", "fetch the file itself (Raw, on GitHub)"),
+    ("", b"<html", "a web page", "fetch the file itself (Raw, on GitHub)"),
+    ("", b"404: not found", "what a server says of a missing file", "fetch it again"),
+    ("", b'{"message":', "what a server says of a missing file", "fetch it again"),
+    ("npz", b"PK\x03\x04", "a zip archive", _UNPACK),
+    ("", b"PK\x05\x06", "an empty zip archive", _UNPACK),
+    ("", b"\x1f\x8b", "a gzip archive", _UNPACK),
+    ("", b"BZh", "a bzip2 archive", _UNPACK),
+    ("", b"\xfd7zXZ", "an xz archive", _UNPACK),
+    ("", b"7z\xbc\xaf", "a 7-Zip archive", _UNPACK),
+    ("", b"Rar!", "a RAR archive", _UNPACK),
+    ("", b"(\xb5/\xfd", "a zstd archive", _UNPACK),
+    ("", b"\x89HDF", "an HDF5 or MATLAB file", _SAVE),
+    ("", b"MATLAB 5", "a MATLAB file", _SAVE),
+    ("", b"Kaydara FBX", "an FBX file", "export it as BVH or C3D"),
+    ("", b"; FBX", "an FBX file", "export it as BVH or C3D"),
+    ("", b"glTF", "a glTF file", "export it as BVH, or as OBJ"),
+    ("", b"BLENDER", "a Blender file", "export what it holds"),
+    ("", b"%PDF", "a PDF", ""),
+    ("", b"\x89PNG", "a picture", ""),
+    ("", b"\xff\xd8\xff", "a picture", ""),
+    ("", b"SQLite format", "a database", ""),
+    ("", b"PAR1", "a Parquet file", _SAVE),
+    ("pickle", b"\x80\x02", "a pickle", ""),
+    ("pickle", b"\x80\x03", "a pickle", ""),
+    ("pickle", b"\x80\x04", "a pickle", ""),
+    ("pickle", b"\x80\x05", "a pickle", ""),
+    ("npy", b"\x93NUMPY", "a NumPy array", ""),
+    ("bvh", b"HIERARCHY", "a BVH recording", ""),
+    ("trc", b"PathFileType", "a TRC recording", ""),
+    ("csv", b"Format Version", "a recording of Motive", ""),
+    ("xml", b"<?xml", "XML", ""),
+    ("xml", b"<robot", "a URDF", ""),
+    ("xml", b"<mujoco", "an MJCF", ""),
+    ("xml", b"<sdf", "an SDF", ""),
+    ("", b"ply\n", "a PLY mesh", "save it as OBJ or STL"),
+)
+_START = 512  # [byte] by which a file is told
+
+
+def check_kind(path: Path, expected: str, *own: str) -> bytes:
+    """Refuse a file that is plainly something else, by its first bytes.
+
+    Args:
+        path: The file.
+        expected: What is wanted, for the message: `a scene`.
+        own: Short names of kinds that will do: npz, pickle, npy, bvh, trc, csv, xml.
+
+    Returns:
+        Its first bytes.
+
+    Raises:
+        InputError: It cannot be opened, is empty or of another kind.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(_START)
+    except OSError as e:
+        raise unreadable(path, e) from e
+    if not start:
+        raise InputError(f"{expected}; this file is empty", path)
+    plain = start.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    for short, begins, what, then in _KINDS:
+        if short not in own and plain.startswith(begins.lower()):
+            todo = f": {then}" if then else ""
+            raise InputError(f"{expected}; this is {what}{todo}", path)
+    if start[257:262] == b"ustar":
+        raise InputError(f"{expected}; this is a tar archive: {_UNPACK}", path)
+    return start
+
+
 def read_yaml(path: Path) -> dict:
     """A YAML mapping from disk.
 
@@ -124,6 +201,7 @@ def read_yaml(path: Path) -> dict:
     """
     import yaml  # slow to import, as pydantic below: who catches errors needs neither
 
+    check_kind(path, "YAML")
     try:
         content = yaml.safe_load(path.read_text())
     except OSError as e:

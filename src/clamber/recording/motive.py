@@ -46,17 +46,19 @@ def read_motive(path: Path) -> Points:
     table = np.concatenate(blocks)
     table = place_rows(table[:, 0], table, first, "Frame", path)
     names = unique_names([name for _, name in columns])
+    notes: list[str] = []
     return Points(
         names=names,
         position=table[:, np.array([c["Position"] for c in columns.values()])],
         rate=_rate(said, path),
-        unit=unit_of(said.get("length units", "meters"), path, "line 1, Length Units"),
+        unit=unit_of(said.get("length units", "meters"), "Length Units", notes),
         up="y",
         orientation={
             n: table[:, c["Rotation"]]
             for n, c in zip(names, columns.values(), strict=True)
             if "Rotation" in c
         },
+        notes=tuple(notes),
     )
 
 

@@ -18,10 +18,10 @@ from typing import Annotated, Literal
 import numpy as np
 import pydantic
 
-from clamber.errors import InputError, read_yaml, unreadable, validated
+from clamber.errors import InputError, check_kind, read_yaml, unreadable, validated
 from clamber.model.arguments import checks_types
 from clamber.model.scene import Box, Scene
-from clamber.model.se3 import matrix_from_quat
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy
 from clamber.model.terrain import SceneLike, load_scene, read_obj, to_z_up
 from clamber.recording import arrays, bvh, c3d, motive, trc
 from clamber.recording.built_in import BUILT_IN, load_built_in
@@ -31,8 +31,8 @@ from clamber.recording.demonstration import (
     Demonstration,
     RawTracks,
     build_demonstration,
-    fit_levels,
 )
+from clamber.recording.levels import fit_levels, settle
 from clamber.recording.points import MAX_RATE, METRES, Points, read_safely
 from clamber.recording.skeleton import (
     Recognised,
@@ -46,6 +46,8 @@ Rate = Annotated[float, pydantic.Field(gt=0.0, le=MAX_RATE, allow_inf_nan=False)
 Seconds = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
 Name = Annotated[str, pydantic.Field(min_length=1)]
 Metres = Annotated[float, pydantic.Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+Far = Annotated[float, pydantic.Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)]
+Angle = Annotated[float, pydantic.Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 Scale = Annotated[float, pydantic.Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
 
 # Suffix, what the content begins with and at which byte, and the reader.
@@ -83,6 +85,8 @@ class RecordingFile(pydantic.BaseModel):
     rate: Rate | None = None
     unit: str | Scale | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    offset: Far | tuple[Far, Far, Far] | None = None
+    rotation: tuple[Angle, Angle, Angle] | None = None
     subject: Name | None = None
     boxes: Name | None = None
     ground: Name = FLOOR
@@ -136,6 +140,7 @@ def load_demo(
     rate: float | None = None,
     span: tuple[float, float] | None = None,
     fit_floor: bool = False,
+    subject: str | None = None,
 ) -> Demonstration:
     """Read a recording, or take a built-in one by its name.
 
@@ -148,7 +153,9 @@ def load_demo(
         rate: Of a bare array, or in place of the file's own [Hz].
         span: Part of the recording to keep [s]; of a `recording.yaml`, its own by
             default.
-        fit_floor: Correct the heights of floor and boxes by what rests on them.
+        fit_floor: Correct the heights of floor and boxes by whatever rests on them, not
+            only where the floor is off beyond doubt.
+        subject: Which person, where several were recorded.
 
     Raises:
         InputError: The name is unknown, or the file, or one that it names, or a field
@@ -157,7 +164,8 @@ def load_demo(
     path = Path(path_or_name)
     if str(path_or_name) in BUILT_IN:
         demo = load_built_in(str(path_or_name))
-    elif path.suffix.lower() in SUFFIXES or path.is_file():
+        return fit_levels(demo) if fit_floor else demo
+    if path.suffix.lower() in SUFFIXES or path.is_file():
         if path.suffix.lower() in YAML:
             given = read_yaml(path)
         else:
@@ -167,15 +175,18 @@ def load_demo(
                 names = list(names)
             given = {"file": path.name, "names": names, "rate": rate}
         said = validated(RecordingFile, given, path)
+        if subject is not None:
+            said = said.model_copy(update={"subject": subject})
         given = None if scene is None else load_scene(scene)
         demo = _build(path, said, given, span or said.span)
-    else:
-        expected = (
-            f"one of the built-in demonstrations {list(BUILT_IN)} or a file "
-            f"that ends in {', '.join(SUFFIXES)}"
-        )
-        raise InputError(expected, "recording", value=str(path_or_name))
-    return fit_levels(demo) if fit_floor else demo
+        if fit_floor:
+            return fit_levels(demo)
+        return demo if said.offset is not None else settle(demo)
+    expected = (
+        f"one of the built-in demonstrations {list(BUILT_IN)} or a file "
+        f"that ends in {', '.join(SUFFIXES)}"
+    )
+    raise InputError(expected, "recording", value=str(path_or_name))
 
 
 def read_points(
@@ -191,19 +202,19 @@ def read_points(
     Raises:
         InputError: No reader knows such a file, or it is damaged.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError as e:
-        raise unreadable(path, e) from e
+    start = check_kind(path, "a recording", "npz", "npy", "bvh", "trc", "csv")
     plain = start.lstrip(b'\xef\xbb\xbf" \t\r\n')
     by_content = [
         r for _, at, magic, r in _READERS
         if (plain if at == 0 else start)[at:].startswith(magic)
     ]  # fmt: skip
     by_suffix = [r for suffixes, *_, r in _READERS if path.suffix.lower() in suffixes]
-    # One byte tells little, so that a C3D file must also be called one.
-    certain = [r for r in by_content if r is not c3d.read_c3d or r in by_suffix]
+    # One byte tells little: a C3D file must be called one or send us to its parameters.
+    certain = [
+        r
+        for r in by_content
+        if r is not c3d.read_c3d or r in by_suffix or c3d.is_c3d(start, path)
+    ]
     reader = next(iter([*certain, *by_suffix]), None)
     if reader is None:
         kinds = ", ".join(s for s in SUFFIXES if s not in YAML)
@@ -246,11 +257,20 @@ def _build(
     for column, what in fixed.items():
         raw[column] = _fixed(points, what, unit, path)[first:last]
     up, why_up = _up(said, points, found, raw)
+    R, offset = _moved(said)
     track = {c: unit * to_z_up(x, up) for c, x in raw.items()}
+    if R is not None:
+        track = {c: x @ R.T + offset for c, x in track.items()}
     solved = solve_centres(found, track)
     position = np.stack(list(solved.values()), axis=1)
 
     given = _boxes(said, folder, unit, up) if scene is None else scene
+    if R is not None and scene is None and (said.boxes or "").lower().endswith(".obj"):
+        turned = [
+            replace(b, position=R @ b.position + offset, rotation=R @ b.rotation)
+            for b in given.boxes
+        ]
+        given = replace(given, boxes=tuple(turned))
     boxes, level = lower_to_ground(given.boxes, said.ground, path)
     position[..., 2] -= level
     start = _start(position, list(solved))
@@ -269,9 +289,20 @@ def _build(
                 f"recognised: {found.name} ({len(points.names)} points at "
                 f"{points.rate:g} Hz)",
                 f"unit: {unit:g} m ({why_unit}); up: {up} ({why_up})",
+                *points.notes,
             ),
         )
     )
+
+
+def _moved(said: RecordingFile) -> tuple[np.ndarray | None, np.ndarray]:
+    """Rotation (3, 3) and offset (3,) of what was recorded; None for neither."""
+    if said.offset is None and said.rotation is None:
+        return None, np.zeros(3)
+    offset = (0.0, 0.0, 0.0) if said.offset is None else said.offset
+    if isinstance(offset, float):
+        offset = (0.0, 0.0, offset)
+    return matrix_from_rpy(said.rotation or (0.0, 0.0, 0.0)), np.array(offset)
 
 
 # Where a file does not say its unit the shank does: no two of these agree.
