@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from clamber.errors import InputError
-from clamber.model.terrain import read_obj
+from clamber.model.boxes import read_obj
 from clamber.recording import arrays
 from clamber.recording.demonstration import Demonstration
 from clamber.recording.recording import load_demo, read_points

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from clamber.contact.contact import ContactInterval
 from clamber.errors import InputError
+from clamber.model.boxes import AXES, to_z_up
 from clamber.model.scene import GROUND, Scene
-from clamber.model.terrain import AXES, to_z_up
 from clamber.recording.bvh import read_bvh
 from clamber.recording.demonstration import (
     Demonstration,

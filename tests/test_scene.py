@@ -319,15 +319,17 @@ boxes:
     rpy: [0.0, 0.0, 0.3]
     friction: 0.6
   - {name: shelf, size: [0.2, 0.3, 0.1], position: [2.0, 0.0, 0.5]}
+  - {name: sill, size: [0.2, 0.3, 0.1], position: [2.0, 1.0], bottom: 0.5}
 start: [0.1, 0.2, 0.3]
 goal: [1.6, 0.4, 0.5]
 """,
         )
     )
-    table, shelf = scene.boxes
+    table, shelf, sill = scene.boxes
     assert (scene.ground.friction, table.friction, shelf.friction) == (0.5, 0.6, 0.8)
     np.testing.assert_allclose(table.position, [0.705, 0.1, 0.1375])  # on the ground
-    np.testing.assert_allclose(shelf.position, [2.0, 0.0, 0.55])  # bottom face at 0.5
+    np.testing.assert_allclose(shelf.position, [2.0, 0.0, 0.5])  # as in Python
+    np.testing.assert_allclose(sill.position, [2.0, 1.0, 0.55])
     np.testing.assert_allclose(table.rotation, matrix_from_rpy([0.0, 0.0, 0.3]))
     np.testing.assert_array_equal(scene.start, [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(scene.goal, [1.6, 0.4, 0.5])
@@ -378,6 +380,7 @@ FAULTS = [
     (one_box(size="[1.0, wide, 1.0]"), "boxes.0.size.1"),
     (one_box(position="[730, 0]"), "boxes.0.position.0"),
     (one_box(rpy="[90, 0, 0]"), "boxes.0.rpy.0"),
+    (one_box(position="[1, 0, 0.2]", bottom="0.1"), "boxes.0"),
     (one_box(friction="-0.1"), "boxes.0.friction"),
     (one_box(friction="1.5"), "boxes.0.friction"),
     (one_box(roughness="-0.01"), "boxes.0.roughness"),

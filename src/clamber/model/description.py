@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError, unreadable
+from clamber.errors import InputError, check_kind, unreadable
 from clamber.model.records import short_repr
 from clamber.model.se3 import matrix_from_quat
 
@@ -144,6 +144,7 @@ def _resolve_meshes(
                 hint = f", or its package below {SEARCH_PATH}"
                 expected = "a mesh that is there" + (hint if PACKAGE in name else "")
                 raise InputError(expected, path, where, name)
+            check_kind(found, f"a mesh for {where}")
             mesh.set("filename", str(found.resolve()))
 
 
@@ -407,6 +408,7 @@ def read_xml(path: Path) -> ElementTree.Element:
     Raises:
         InputError: It is no such file, or too large.
     """
+    check_kind(path, "XML", "xml")
     content = _read_content(path)
     if b"\0" in content:  # UTF-16 would hide what is looked for next
         raise InputError("XML in UTF-8", path)

@@ -277,18 +277,17 @@ def _read_samples(
     kind = "f4" if header.scale < 0 else "i2"
     width = int(kind[1])
     row = (4 * header.points + header.analog) * width
-    frames, end = header.frames, header.start + header.frames * row
-    if end > len(content):
-        present = (len(content) - header.start) // row
-        if present >= _MOST * frames:
-            notes.append(f"it says {frames} samples and ends after {present}")
-            frames, end = present, header.start + present * row
-    if end > len(content):
+    frames, present = header.frames, (len(content) - header.start) // row
+    if present < _MOST * frames:
         expected = (
-            f"{header.frames} samples of {row} bytes each from byte {header.start} on; "
+            f"{frames} samples of {row} bytes each from byte {header.start} on; "
             f"the file ends after {present}"
         )
         raise InputError(expected, path, f"byte {len(content)}")
+    if present < frames:
+        notes.append(f"it says {frames} samples and ends after {present}")
+        frames = present
+    end = header.start + frames * row
     rows = content[header.start : end].reshape(frames, row)
     out = np.empty((frames, header.points, 3), dtype=np.float32)
     step = max(1, (1 << 22) // row)

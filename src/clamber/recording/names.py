@@ -260,7 +260,7 @@ def _sided(pieces: Sequence[str]) -> list[tuple[str, str]]:
     joined = "".join(pieces).lower()
     for k in (0, len(pieces) - 1, *range(1, len(pieces) - 1)):
         if len(pieces) > 1 and (side := _SIDES.get(pieces[k].lower())):
-            out.append((side, "".join(pieces[:k] + list(pieces[k + 1 :])).lower()))
+            out.append((side, "".join([*pieces[:k], *pieces[k + 1 :]]).lower()))
     for word, side in (("left", "L"), ("right", "R")):
         if joined.startswith(word):
             out.append((side, joined.removeprefix(word)))

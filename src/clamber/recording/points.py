@@ -50,6 +50,8 @@ class Points:
         usual_up: What is usual for this format, where the file does not say.
         orientation: (T, 4) wxyz of rigid bodies and bones by name, in the file's axes;
             NaN where they are not seen.
+        offsets: Heights of points over what their parts rest on, by kind, where they
+            are known [m].
         notes: What is odd about the file, and what was made of it.
     """
 
@@ -60,6 +62,7 @@ class Points:
     up: str | None = None
     usual_up: str = "z"
     orientation: Mapping[str, np.ndarray] = field(default_factory=dict)
+    offsets: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     __repr__ = short_repr

@@ -20,9 +20,10 @@ import pydantic
 
 from clamber.errors import InputError, check_kind, read_yaml, unreadable, validated
 from clamber.model.arguments import checks_types
+from clamber.model.boxes import read_obj, to_z_up
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy
-from clamber.model.terrain import SceneLike, load_scene, read_obj, to_z_up
+from clamber.model.terrain import SceneLike, load_scene
 from clamber.recording import arrays, bvh, c3d, motive, trc
 from clamber.recording.built_in import BUILT_IN, load_built_in
 from clamber.recording.demonstration import (
@@ -51,13 +52,14 @@ Angle = Annotated[float, pydantic.Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 Scale = Annotated[float, pydantic.Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
 
 # Suffix, what the content begins with and at which byte, and the reader.
-_READERS: tuple[tuple[tuple[str, ...], int, bytes, Callable[[Path], Points]], ...] = (
+_READERS: tuple[tuple[tuple[str, ...], int, bytes, Callable[..., Points]], ...] = (
     ((".c3d",), 1, bytes([c3d.KEY]), c3d.read_c3d),
     ((".trc",), 0, trc.MAGIC, trc.read_trc),
     ((".bvh",), 0, bvh.MAGIC, bvh.read_bvh),
     ((".csv",), 0, motive.MAGIC, motive.read_motive),
     ((".npy",), 0, arrays.NPY_MAGIC, arrays.read_array),
     ((".npz",), 0, arrays.NPZ_MAGIC, arrays.read_array),
+    ((".pkl", ".pickle"), 0, b"\x80", arrays.read_pickled),
 )
 YAML = (".yaml", ".yml")
 FLOOR = "floor"
@@ -88,6 +90,8 @@ class RecordingFile(pydantic.BaseModel):
     offset: Far | tuple[Far, Far, Far] | None = None
     rotation: tuple[Angle, Angle, Angle] | None = None
     subject: Name | None = None
+    body_model: Name | None = None
+    robot: Name | None = None
     boxes: Name | None = None
     ground: Name = FLOOR
     span: tuple[Seconds, Seconds] | None = None
@@ -141,13 +145,16 @@ def load_demo(
     span: tuple[float, float] | None = None,
     fit_floor: bool = False,
     subject: str | None = None,
+    body_model: str | Path | None = None,
+    robot: str | Path | None = None,
 ) -> Demonstration:
     """Read a recording, or take a built-in one by its name.
 
     Args:
         path_or_name: `climb` or `crossing` for a built-in synthetic one, a
-            `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, or an array
-            (`.npy`, or `.npz` with `positions`, `names` and `rate`).
+            `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, an array
+            (`.npy`, or `.npz` with `positions`, `names` and `rate`), or the motion of a
+            body or a robot (`.npz`, `.pkl`).
         scene: Replaces the boxes of the recording, in its coordinates.
         names: Of the columns of a bare array: a list, or a JSON file with one.
         rate: Of a bare array, or in place of the file's own [Hz].
@@ -156,6 +163,9 @@ def load_demo(
         fit_floor: Correct the heights of floor and boxes by whatever rests on them, not
             only where the floor is off beyond doubt.
         subject: Which person, where several were recorded.
+        body_model: SMPL's, SMPL-H's or SMPL-X's file, for poses without joints.
+        robot: Whose motion it is, where it is a robot's: a built-in one by name, or a
+            robot.yaml.
 
     Raises:
         InputError: The name is unknown, or the file, or one that it names, or a field
@@ -175,8 +185,14 @@ def load_demo(
                 names = list(names)
             given = {"file": path.name, "names": names, "rate": rate}
         said = validated(RecordingFile, given, path)
-        if subject is not None:
-            said = said.model_copy(update={"subject": subject})
+        more = {"subject": subject}
+        if body_model is not None:
+            more["body_model"] = str(Path(body_model).absolute())
+        if robot is not None:
+            is_file = Path(robot).suffix != ""
+            more["robot"] = str(Path(robot).absolute() if is_file else robot)
+        more = {k: v for k, v in more.items() if v is not None}
+        said = said.model_copy(update=more) if more else said
         given = None if scene is None else load_scene(scene)
         demo = _build(path, said, given, span or said.span)
         if fit_floor:
@@ -190,7 +206,13 @@ def load_demo(
 
 
 def read_points(
-    path: Path, *, names: Sequence[str] | None = None, rate: float | None = None
+    path: Path,
+    *,
+    names: Sequence[str] | None = None,
+    rate: float | None = None,
+    subject: str | None = None,
+    body_model: Path | None = None,
+    robot: str | None = None,
 ) -> Points:
     """Named points of a file, by the reader that its content, or its suffix, calls for.
 
@@ -198,11 +220,14 @@ def read_points(
         path: The file.
         names: Of the columns of a bare array.
         rate: In place of the file's own, where it has one [Hz].
+        subject: Which of several motions in a pickle.
+        body_model: SMPL's file, for poses without joints.
+        robot: Whose motion it is, where it is a robot's.
 
     Raises:
         InputError: No reader knows such a file, or it is damaged.
     """
-    start = check_kind(path, "a recording", "npz", "npy", "bvh", "trc", "csv")
+    start = check_kind(path, "a recording", "npz", "npy", "bvh", "trc", "csv", "pickle")
     plain = start.lstrip(b'\xef\xbb\xbf" \t\r\n')
     by_content = [
         r for _, at, magic, r in _READERS
@@ -219,8 +244,11 @@ def read_points(
     if reader is None:
         kinds = ", ".join(s for s in SUFFIXES if s not in YAML)
         raise InputError(f"a recording: {kinds}", path)
-    if reader is arrays.read_array:
-        reader = partial(arrays.read_array, names=names, rate=rate)
+    if reader in (arrays.read_array, arrays.read_pickled):
+        given = arrays.Given(
+            names=names, rate=rate, subject=subject, body_model=body_model, robot=robot
+        )
+        reader = partial(reader, given=given)
     points = read_safely(reader, path)
     return points if rate is None else replace(points, rate=rate)
 
@@ -234,7 +262,15 @@ def _build(
     """The record, in the coordinates in which the chosen ground is z = 0."""
     folder = path.parent
     names = _read_names(said.names, folder, path) if said.names else None
-    points = read_points(folder / said.file, names=names, rate=said.rate)
+    robot = said.robot
+    points = read_points(
+        folder / said.file,
+        names=names,
+        rate=said.rate,
+        subject=said.subject,
+        body_model=folder / said.body_model if said.body_model else None,
+        robot=str(folder / robot) if robot and Path(robot).suffix else robot,
+    )
     first, last = _span(span, len(points.position), points.rate, path)
     labels, fixed = list(points.names), {}
     parts: dict[str, str | list[str]] = {}
@@ -246,7 +282,9 @@ def _build(
             labels.append(label)
         else:
             parts[part] = what
-    found = recognise(labels, parts=parts, subject=said.subject, source=path)
+    is_pickle = Path(said.file).suffix.lower() in (".pkl", ".pickle")
+    subject = None if is_pickle else said.subject  # it has chosen the motion already
+    found = recognise(labels, parts=parts, subject=subject, source=path)
     with np.errstate(invalid="ignore"):  # NaN of any kind
         raw = {
             c: points.position[first:last, c].astype(float)
@@ -283,7 +321,7 @@ def _build(
             t0=first / points.rate,
             scene=replace(given, boxes=boxes, start=start, goal=None),
             max_gap=said.max_gap,
-            offsets=said.offsets or {},
+            offsets={**points.offsets, **(said.offsets or {})},
             raised=found.raised,
             notes=(
                 f"recognised: {found.name} ({len(points.names)} points at "

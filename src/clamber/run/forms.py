@@ -74,7 +74,8 @@ def _write_scene(scene: Scene) -> dict[str, Any]:
             {
                 "name": b.name,
                 "size": b.size,
-                "position": b.position - [0.0, 0.0, b.size[2] / 2],
+                "position": b.position[:2],
+                "bottom": b.position[2] - b.size[2] / 2,
                 "rpy": _rpy(b.rotation),
                 "friction": b.friction,
                 "roughness": b.roughness,
@@ -90,12 +91,14 @@ def _read_scene(at: At) -> Scene:
     """As it was written: boxes of a recording may be called as no robot's can."""
     boxes = []
     for box in at.key("boxes").list():
-        size, bottom = (CODEC.decode(Vector, box.key(n)) for n in ("size", "position"))
+        size, place = (CODEC.decode(Vector, box.key(n)) for n in ("size", "position"))
+        if len(place) == 2:  # with a third number, as it once was, that is the bottom
+            place = [*place, CODEC.decode(float, box.key("bottom"))]
         boxes.append(
             Box(
                 **CODEC.fields(Box, box, without=("size", "position", "rotation")),
                 size=np.array(size),
-                position=np.add(bottom, [0.0, 0.0, size[2] / 2]),
+                position=np.add(place, [0.0, 0.0, size[2] / 2]),
                 rotation=matrix_from_rpy(CODEC.decode(Vector, box.key("rpy"))),
             )
         )
