@@ -48,7 +48,7 @@ def body_motion(joints: int = 24, samples: int = 60) -> dict[str, np.ndarray]:
     poses = np.zeros((samples, joints, 3))
     poses[:, 0, 0] = np.pi / 2  # y up becomes z up
     poses[:, 4, 0] = np.linspace(0.0, 0.8, samples)
-    trans = np.tile([0.5, 0.1, 0.96], (samples, 1))
+    trans = np.tile([0.5, 0.1, 1.01], (samples, 1))
     return {
         "poses": poses.reshape(samples, -1),
         "trans": trans,

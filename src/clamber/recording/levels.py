@@ -18,6 +18,7 @@ from clamber.model.scene import Box, Scene, Support
 from clamber.recording.demonstration import SIDES, Demonstration, runs
 
 _EVIDENCE = ("Foot", "Knee", "Hand")
+_LEGS = ("Foot", "Knee")  # that tell more than a hand
 _SEARCH = 0.10  # [m] further off may be another surface
 _FAR = 1.5  # [m] but the floor is looked for so far, where nothing rests nearer
 _CLUSTER = 0.02  # [m] what rests at one height is within this
@@ -59,7 +60,7 @@ def find_levels(demo: Demonstration) -> tuple[Level, ...]:
 
 def _level(demo: Demonstration, support: Support, reach: float) -> Level | None:
     """Of one support, by what rests within `reach` [m] of it; None without evidence."""
-    for part in _EVIDENCE:
+    for part in _EVIDENCE if reach <= _SEARCH else _LEGS:
         both = [_resting(demo, s + part, support, reach) for s in SIDES]
         clearance = np.concatenate(both)
         if reach > _SEARCH:
@@ -85,7 +86,10 @@ def _lowest(clearance: np.ndarray) -> np.ndarray:
 def find_floor(demo: Demonstration) -> Level | None:
     """Where the floor is by what rests on it, however far off; None: nothing rests."""
     ground = demo.scene.supports[0]
-    return _level(demo, ground, _SEARCH) or _level(demo, ground, _FAR)
+    near = _level(demo, ground, _SEARCH)
+    if near is not None and near.part in _LEGS:
+        return near
+    return _level(demo, ground, _FAR) or near
 
 
 def settle(demo: Demonstration) -> Demonstration:
@@ -112,7 +116,7 @@ def settle(demo: Demonstration) -> Demonstration:
         )
         fitted = fit_levels(demo)
         return replace(fitted, notes=(*fitted.notes, note))
-    if floor.correction < 0 and len(find_levels(demo)) == 0:
+    if floor.correction < 0 and not any(x.part in _LEGS for x in find_levels(demo)):
         raise InputError(f"a person over the floor: {said}", demo.source, "offset")
     return replace(demo, notes=(*demo.notes, f"the floor may be off: {said}"))
 

@@ -133,11 +133,10 @@ def _rate(
     rate = _number(said.get("datarate"))
     if rate is not None and rate > 0:
         return rate
-    step = np.diff(time)
-    step = step[step > 0]
-    if not len(step):
+    span = float(time[-1] - time[0])
+    if not span > 0:
         raise InputError("a rate under `DataRate`, or times", path, "line 3")
-    rate = float(1.0 / np.median(step))
+    rate = (len(time) - 1) / span
     notes.append(f"DataRate says nothing: {rate:.6g} Hz by the times")
     return rate
 
