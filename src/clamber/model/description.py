@@ -144,7 +144,7 @@ def _resolve_meshes(
                 hint = f", or its package below {SEARCH_PATH}"
                 expected = "a mesh that is there" + (hint if PACKAGE in name else "")
                 raise InputError(expected, path, where, name)
-            check_kind(found, f"a mesh for {where}")
+            check_kind(found, f"a mesh for {where}", "xml")
             mesh.set("filename", str(found.resolve()))
 
 

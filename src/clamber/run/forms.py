@@ -91,14 +91,17 @@ def _read_scene(at: At) -> Scene:
     """As it was written: boxes of a recording may be called as no robot's can."""
     boxes = []
     for box in at.key("boxes").list():
-        size, place = (CODEC.decode(Vector, box.key(n)) for n in ("size", "position"))
-        if len(place) == 2:  # with a third number, as it once was, that is the bottom
-            place = [*place, CODEC.decode(float, box.key("bottom"))]
+        size, place = CODEC.decode(Vector, box.key("size")), box.key("position")
+        if len(place.list()) == 3:  # as it once was: the third is that of the bottom
+            bottom = CODEC.decode(Vector, place)
+        else:
+            x, y = CODEC.decode(tuple[float, float], place)
+            bottom = (x, y, CODEC.decode(float, box.key("bottom")))
         boxes.append(
             Box(
                 **CODEC.fields(Box, box, without=("size", "position", "rotation")),
                 size=np.array(size),
-                position=np.add(place, [0.0, 0.0, size[2] / 2]),
+                position=np.add(bottom, [0.0, 0.0, size[2] / 2]),
                 rotation=matrix_from_rpy(CODEC.decode(Vector, box.key("rpy"))),
             )
         )
