@@ -153,7 +153,7 @@ def _with_model(folder: Path, path: Path) -> object:
     """A body's motion with a damaged model."""
     try:
         return load_demo(folder / "motion.npz", body_model=path)
-    except InputError as e:  # where it is the joints that are wrong, the motion is named
+    except InputError as e:  # of wrong joints the motion is named
         raise InputError(e.expected, f"{path}, {e.source}", e.field) from e
 
 
