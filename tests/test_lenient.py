@@ -17,11 +17,13 @@ from clamber.errors import InputError
 from clamber.model.robot import load_robot
 from clamber.model.scene import Box, Scene
 from clamber.model.terrain import load_scene
+from clamber.planning.planner import plan
 from clamber.recording.demonstration import Demonstration
 from clamber.recording.detect import detect_contacts
 from clamber.recording.levels import find_floor
 from clamber.recording.pickles import as_array, read_pickle
 from clamber.recording.recording import load_demo, read_points
+from clamber.run.folder import load_sequence
 from support.bodies import REST, body_model, body_motion, robot_motion
 from support.climb import ClimbOptions, synthesize_climb
 from support.files import bvh_text, c3d_bytes, from_z_up, trc_text
@@ -384,6 +386,26 @@ def test_a_zip_and_a_file_of_another_kind_are_told(tmp_path):
         load_robot(tmp_path / "robot.yaml")
 
 
+def test_meshes_and_files_of_runs_are_told_too(tmp_path):
+    pointer = DISGUISED["a Git LFS pointer"]
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "m.stl").write_bytes(pointer)
+    (tmp_path / "s.xml").write_text(
+        """<mujoco><compiler meshdir="meshes"/><asset><mesh name="m" file="m.stl"/>
+        </asset><worldbody><geom type="mesh" mesh="m"/></worldbody></mujoco>"""
+    )
+    (tmp_path / "s.urdf").write_text(
+        """<robot name="r"><link name="top"><collision><geometry>
+        <mesh filename="meshes/m.stl"/></geometry></collision></link></robot>"""
+    )
+    for name in ("s.xml", "s.urdf"):
+        with pytest.raises(InputError, match=r"m\.stl: .*Git LFS pointer"):
+            load_scene(tmp_path / name)
+    (tmp_path / "sequence.json").write_bytes(pointer)
+    with pytest.raises(InputError, match="a JSON file; this is a Git LFS pointer"):
+        load_sequence(tmp_path / "sequence.json")
+
+
 # SMPL.
 
 
@@ -541,6 +563,33 @@ def test_the_words_of_other_tools_say_the_same(tmp_path, form):
     subject = "walk" if form == "nested" else None
     back = load_demo(path, robot="coman", subject=subject)
     np.testing.assert_allclose(back.position, expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_motion_of_a_climb_says_which_contacts_it_makes(
+    tmp_path, coman, demo_sequence
+):
+    """A plan's own motion gives its contacts back in their order, and a plan again."""
+    scene = Scene.from_height(0.2)
+    made = plan(demo_sequence, coman, scene)
+    t, world = made.trajectory.time, made.world
+    q = made.trajectory.q[np.searchsorted(t, np.arange(0.0, t[-1], 1 / 30))]
+    motion = {"fps": 30, "root_pos": q[:, :3], "root_rot": q[:, [4, 5, 6, 3]],
+              "dof_pos": q[:, world.qadr]}  # fmt: skip
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(motion))
+    sequence = detect_contacts(
+        load_demo(tmp_path / "a.pkl", robot="coman", scene=scene)
+    )
+    first = {}
+    for i in sorted(sequence.intervals, key=lambda i: i.t0):
+        first.setdefault((i.part, i.contact.support), i.t0)
+    wanted: list[tuple[str, str]] = []
+    for change in made.changes:
+        for c in change.keyframe.stance:
+            if c.support == "box" and (c.surface, "box") not in wanted:
+                wanted.append((c.surface, "box"))
+    assert [k for k in first if k[1] == "box"] == wanted
+    assert plan(sequence, coman, scene).complete
 
 
 def test_another_robots_motion_is_refused_with_both_counts(tmp_path):

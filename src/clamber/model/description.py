@@ -93,6 +93,10 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
             _take_meshes(spec, notes)
         elif root.tag in ("mujoco", "mujocoinclude"):
             spec = mujoco.MjSpec.from_file(str(path))
+            for mesh in spec.meshes:
+                file = path.parent / spec.meshdir / mesh.file
+                if mesh.file and file.is_file():
+                    check_kind(file, f"a mesh for {mesh.name!r}", "xml")
             mimics = {
                 str(e.name1): str(e.name2)
                 for e in spec.equalities
