@@ -17,6 +17,7 @@ from clamber.model.scene import GROUND, MAX_LENGTH, Box, Scene, finite, length
 from clamber.model.se3 import matrix_from_rpy
 
 DRAWN = (".obj", ".xml", ".mjcf", ".urdf", ".sdf", ".world")  # files of boxes
+_MESHES = (".stl", ".dae", ".ply", ".usd", ".usda", ".usdz", ".glb", ".gltf", ".fbx")
 
 Number = Annotated[float, pydantic.AfterValidator(finite)]
 Length = Annotated[float, pydantic.AfterValidator(length)]
@@ -139,6 +140,9 @@ def load_scene(path: SceneLike) -> Scene:
         return Scene.from_height(float(path))
     path = Path(path)
     drawn = path.suffix.lower() in DRAWN
+    if path.suffix.lower() in _MESHES:
+        expected = f"a scene.yaml, or boxes as {', '.join(DRAWN)}: export it as OBJ"
+        raise InputError(expected, path)
     content = {"boxes": path.name} if drawn else read_yaml(path)
     return validated(SceneFile, content, path).scene(path.parent)
 

@@ -87,6 +87,11 @@ def _read_heading(
             rows[cells[1].strip().lower()] = cells
         before = cells
     expected = "`Format Version` first, and later a line that begins with Frame,Time"
+    if not said:
+        expected = (
+            "Motive's CSV, which begins with `Format Version`; of another table save "
+            "positions (T, F, 3), names and rate as .npz"
+        )
     raise InputError(expected, path, f"line {_LINES if said else 1}")
 
 

@@ -23,7 +23,7 @@ from clamber.model.arguments import checks_types
 from clamber.model.boxes import read_obj, to_z_up
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy
-from clamber.model.terrain import SceneLike, load_scene
+from clamber.model.terrain import DRAWN, SceneLike, load_scene
 from clamber.recording import arrays, bvh, c3d, motive, trc
 from clamber.recording.built_in import BUILT_IN, load_built_in
 from clamber.recording.demonstration import (
@@ -485,10 +485,11 @@ def _boxes(said: RecordingFile, folder: Path, unit: float, up: str) -> Scene:
     if said.boxes is None:
         return Scene(start=np.zeros(3))
     path = folder / said.boxes
-    if path.suffix.lower() in YAML:
+    if path.suffix.lower() in (*YAML, *DRAWN) and path.suffix.lower() != ".obj":
         return load_scene(path)
     if path.suffix.lower() != ".obj":
-        raise InputError("an .obj or a scene.yaml", path, "boxes")
+        expected = f"a scene.yaml, or boxes as {', '.join(DRAWN)}"
+        raise InputError(expected, path, "boxes")
     return Scene(boxes=tuple(read_obj(path, unit, up)), start=np.zeros(3))
 
 

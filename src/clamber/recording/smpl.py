@@ -85,7 +85,8 @@ def read_body(
         expected = f"a body model of {sorted(JOINTS)} joints"
         raise InputError(expected, model, "J_regressor", joints)
     kind, names = JOINTS[joints]
-    used = min(joints, pose.shape[1])
+    # Joints of the body are the same in all; fingers and faces differ.
+    used = joints if pose.shape[1] == joints else min(len(_BODY), pose.shape[1])
     angles = np.zeros((len(pose), joints, 3))
     angles[:, :used] = pose[:, :used]
     position = _kinematics(angles, rest, parents) + place[:, None]
