@@ -268,6 +268,20 @@ def test_two_people_of_a_bvh_are_told_apart(tmp_path):
     np.testing.assert_allclose(back.point("LKnee"), few.point("LKnee"), atol=1e-5)
 
 
+def test_landmarks_of_mediapipe_need_no_names(tmp_path):
+    """FreeMoCap's array: 33 points in millimetres."""
+    demo, _ = climb()
+    order = {"Shoulder": 11, "Elbow": 13, "Hand": 15, "Hip": 23, "Knee": 25, "Foot": 27,
+             "Foot.toe": 31}  # fmt: skip
+    p = np.zeros((len(demo.t), 33, 3))
+    for word, k in order.items():
+        p[:, k], p[:, k + 1] = (1000.0 * demo.point(s + word) for s in "LR")
+    np.save(tmp_path / "a.npy", p)
+    back = load_demo(tmp_path / "a.npy", rate=30.0)
+    assert "MediaPipe landmarks" in back.notes[0]
+    np.testing.assert_allclose(back.point("RKnee"), demo.point("RKnee"))
+
+
 # Floors.
 
 

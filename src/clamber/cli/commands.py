@@ -107,6 +107,8 @@ class ClimbCommand:
                     shown = {"demonstration": (demo, sequence)}
                     drawn = [draw(folder, parts=("plan",), **shown)]
                     done = self.execution.simulate(plan, folder, report, None)
+            usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
+            self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
             code = conclude(self.output, folder, plan, done, clock)
             if done is not None:
                 drawn.append(draw(folder, parts=("climb",)))
