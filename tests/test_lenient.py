@@ -499,6 +499,14 @@ def test_a_pickle_that_calls_anything_is_refused_without_calling_it(tmp_path):
     assert not flag.exists()
 
 
+def test_a_pickle_cut_anywhere_is_refused(tmp_path):
+    raw = pickle.dumps({"a": 2.5, "b": np.arange(3), "c": ["x", 1]}, protocol=2)
+    for k in range(2, len(raw)):
+        (tmp_path / "a.pkl").write_bytes(raw[:k])
+        with pytest.raises(InputError, match="a pickle"):
+            read_pickle(tmp_path / "a.pkl")
+
+
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_arrays_come_back_as_they_were(tmp_path, protocol):
     there = {

@@ -11,6 +11,7 @@ import io
 import math
 import pickle
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,8 +27,8 @@ _HARMLESS = re.compile(
 )
 _CODE = re.compile(r"[|<>=]?[biufc]\d{1,2}|[|<>=]?[SU]\d{1,6}|[|<>=]?\?")
 _TOO_MUCH = (
-    ValueError, EOFError, TypeError, AttributeError, KeyError, IndexError, MemoryError,
-    OverflowError, RecursionError, NotImplementedError, pickle.UnpicklingError,
+    ValueError, EOFError, TypeError, AttributeError, LookupError, MemoryError, struct.error,
+    ArithmeticError, RecursionError, NotImplementedError, pickle.UnpicklingError,
     UnicodeError, AssertionError, ImportError, StopIteration,
 )  # fmt: skip
 
