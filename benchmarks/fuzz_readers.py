@@ -126,7 +126,8 @@ def readers(folder: Path) -> dict[str, tuple[str, list[bytes], Callable]]:
                   partial(_with_model, folder)),
         "robot": ("pkl", [pickle.dumps(robot_motion(), protocol=k) for k in (2, 4)],
                   partial(load_demo, robot="coman")),
-        "recording": ("yaml", [recording(names)], load_demo),
+        "recording": ("yaml", [recording(names)],
+                      lambda path: _with_another(load_demo, path, path)),
         "obj": ("obj", [(box_obj([1, 2, 0.5], [0, 0, 0.25], 0.3, name="step")
                          + box_obj([1, 1, 1], [3, 0, 0.5], 0.0)).encode(),
                         split_box()], load_scene),
@@ -151,9 +152,16 @@ def recording(names: list[str]) -> bytes:
 
 def _with_model(folder: Path, path: Path) -> object:
     """A body's motion with a damaged model."""
+    return _with_another(
+        partial(load_demo, body_model=path), folder / "motion.npz", path
+    )
+
+
+def _with_another(read: Callable, first: Path, path: Path) -> object:
+    """What a damaged file says of another; a refusal may name that one."""
     try:
-        return load_demo(folder / "motion.npz", body_model=path)
-    except InputError as e:  # of wrong joints the motion is named
+        return read(first)
+    except InputError as e:
         raise InputError(e.expected, f"{path}, {e.source}", e.field) from e
 
 

@@ -27,9 +27,9 @@ _HARMLESS = re.compile(
 )
 _CODE = re.compile(r"[|<>=]?[biufc]\d{1,2}|[|<>=]?[SU]\d{1,6}|[|<>=]?\?")
 _TOO_MUCH = (
-    ValueError, EOFError, TypeError, AttributeError, LookupError, MemoryError, struct.error,
+    ValueError, EOFError, TypeError, AttributeError, LookupError, MemoryError,
     ArithmeticError, RecursionError, NotImplementedError, pickle.UnpicklingError,
-    UnicodeError, AssertionError, ImportError, StopIteration,
+    struct.error, UnicodeError, AssertionError, ImportError, StopIteration,
 )  # fmt: skip
 
 
