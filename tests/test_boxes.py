@@ -83,6 +83,11 @@ def test_a_scene_names_a_drawing(tmp_path, rng):
         ("w.xml", MJCF.replace('type="box"', 'type="sphere"', 1), "boxes and a plane"),
         (
             "w.xml",
+            MJCF.replace('<geom type="box"', '<geom type="sphere"'),
+            r"the geom at \(2, 0, 0.2\) is 'sphere'",
+        ),
+        (
+            "w.xml",
             MJCF.replace('friction="0.7"', 'friction="1.5"'),
             "'table'.*friction",
         ),
@@ -97,6 +102,167 @@ def test_what_cannot_be_a_scene_is_named(tmp_path, name, text, word):
     with pytest.raises(InputError, match=word) as e:
         load_scene(path)
     assert str(path) in str(e.value)
+
+
+def only(path: Path) -> Box:
+    (box,) = load_scene(path).boxes
+    return box
+
+
+URDF = """<robot name="r"><link name="world"/><link name="top">
+  <collision><origin xyz="0 0 0.1" rpy="0 0 0.3"/>{shape}</collision></link>
+  <joint name="j" type="fixed"><parent link="world"/><child link="top"/>
+    <origin xyz="0.8 0.1 0.2"/></joint></robot>"""
+SDF = """<sdf version="1.7"><world name="w"><model name="floor"><static>true</static>
+  <link name="l"><collision name="c"><geometry><plane><normal>0 0 1</normal></plane>
+  </geometry></collision></link></model>
+  <model name="top"><static>1</static><pose>0.8 0.1 0.2 0 0 0</pose><link name="l">
+  <pose>0 0 0 0 0 0.3</pose><collision name="c"><pose>0 0 0.1 0 0 0</pose>{shape}
+  <surface><friction><ode><mu>0.6</mu></ode></friction></surface></collision></link>
+  </model></world></sdf>"""
+BOX = {
+    "urdf": '<geometry><box size="1.0 1.2 0.2"/></geometry>',
+    "sdf": "<geometry><box><size>1.0 1.2 0.2</size></box></geometry>",
+}
+MESH = {
+    "urdf": '<geometry><mesh filename="m.obj"/></geometry>',
+    "sdf": "<geometry><mesh><uri>m.obj</uri></mesh></geometry>",
+}
+TRIANGLES = "013 032 457 476 015 054 237 276 026 064 137 175"  # of signs in binary
+
+
+def triangulated(size, split: bool) -> str:
+    """A closed box of triangles, each with corners of its own if split."""
+    corner = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)]) - 0.5
+    faces = [[int(c) for c in f] for f in TRIANGLES.split()]
+    if split:
+        corner = corner[[i for f in faces for i in f]]
+        faces = np.arange(36).reshape(12, 3).tolist()
+    v = "".join("v {} {} {}\n".format(*p) for p in corner * size)
+    return v + "".join("f {} {} {}\n".format(*(i + 1 for i in f)) for f in faces)
+
+
+@pytest.mark.parametrize("shapes", [BOX, MESH], ids=["box", "mesh"])
+@pytest.mark.parametrize("kind", ["urdf", "sdf"])
+@pytest.mark.parametrize("split", [False, True])
+def test_a_box_of_a_urdf_or_sdf_is_where_its_poses_put_it(
+    tmp_path, kind, shapes, split
+):
+    (tmp_path / "m.obj").write_text(triangulated([1.0, 1.2, 0.2], split))
+    text = {"urdf": URDF, "sdf": SDF}[kind].format(shape=shapes[kind])
+    (tmp_path / f"s.{kind}").write_text(text)
+    found = only(tmp_path / f"s.{kind}")
+    assert found.name == "top"
+    assert found.friction == {"urdf": 0.8, "sdf": 0.6}[kind]
+    truth = Box(
+        name="t",
+        size=np.array([1.0, 1.2, 0.2]),
+        position=np.array([0.8, 0.1, 0.3]),
+        rotation=matrix_from_rpy([0.0, 0.0, 0.3]),
+    )
+    np.testing.assert_allclose(corners(found), corners(truth), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["urdf", "sdf", "xml"])
+def test_a_mesh_that_is_no_box_is_named_with_what_can_be_done(tmp_path, kind):
+    text = triangulated([1.0, 1.2, 0.2], False).replace(
+        "v 0.5 0.6 0.1", "v 0.1 0.2 0.1"
+    )
+    (tmp_path / "m.obj").write_text(text)
+    scene = {"urdf": URDF, "sdf": SDF}.get(kind, "").format(shape=MESH.get(kind))
+    if kind == "xml":
+        scene = """<mujoco><asset><mesh name="rock" file="m.obj"/></asset><worldbody>
+          <geom type="mesh" mesh="rock"/></worldbody></mujoco>"""
+    (tmp_path / f"s.{kind}").write_text(scene)
+    word = {"xml": "mesh 'rock'", "sdf": "mesh 'm.obj'", "urdf": "mesh 'm'"}[kind]
+    with pytest.raises(InputError, match=f"{word} is '8 corners'.*put boxes") as e:
+        load_scene(tmp_path / f"s.{kind}")
+    assert "\n" not in str(e.value)
+
+
+def test_a_mesh_of_an_mjcf_with_the_corners_of_a_box_is_one(tmp_path):
+    (tmp_path / "m.obj").write_text(triangulated([1.0, 1.2, 0.2], True))
+    (tmp_path / "s.xml").write_text(
+        """<mujoco><asset><mesh name="m" file="m.obj"/></asset><worldbody>
+        <body name="desk" pos="0.8 0 0.1"><geom type="mesh" mesh="m"/></body>
+        </worldbody></mujoco>"""
+    )
+    found = only(tmp_path / "s.xml")
+    assert found.name == "desk"
+    assert found.top.position[2] == pytest.approx(0.2, abs=1e-6)
+    np.testing.assert_allclose(sorted(found.size), [0.2, 1.0, 1.2], atol=1e-6)
+
+
+def test_an_sdf_that_includes_others_or_places_things_by_name_says_so(tmp_path):
+    path = tmp_path / "s.sdf"
+    path.write_text("<sdf><world><include><uri>model://t</uri></include>"
+                    "<model name='m'/></world></sdf>")  # fmt: skip
+    with pytest.raises(InputError, match="<include> is 'model://t'"):
+        load_scene(path)
+    path.write_text(SDF.format(shape=BOX["sdf"]).replace("<pose>0 0 0.1",
+                    "<pose relative_to='x'>0 0 0.1"))  # fmt: skip
+    with pytest.raises(InputError, match="relative_to"):
+        load_scene(path)
+
+
+# OBJ as exporters write them.
+
+
+@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize("faces", [False, True])
+def test_a_box_whose_faces_have_corners_of_their_own_is_one_box(tmp_path, split, faces):
+    text = triangulated([1.0, 1.2, 0.2], split)
+    if not faces:
+        text = "\n".join(x for x in text.splitlines() if x[0] == "v")
+    moved = text.replace("v ", "v ").splitlines()
+    moved = [
+        f"v {float(a) + 0.8} {b} {float(c) + 0.1}"
+        if kind == "v" else f"{kind} {a} {b} {c}"
+        for kind, a, b, c in (line.split() for line in moved)
+    ]  # fmt: skip
+    (tmp_path / "b.obj").write_text("o table\n" + "\n".join(moved))
+    found = only(tmp_path / "b.obj")
+    assert found.name == "table"
+    np.testing.assert_allclose(found.position, [0.8, 0.0, 0.1], atol=1e-6)
+    np.testing.assert_allclose(sorted(found.size), [0.2, 1.0, 1.2], atol=1e-6)
+
+
+def test_boxes_that_share_corners_stay_apart_where_faces_tell(tmp_path):
+    """Two steps that touch: eight vertices each, four places in common."""
+    low = triangulated([0.3, 1.0, 0.2], False).splitlines()
+    text, first = "", 0
+    for name, x in (("a", 0.5), ("b", 0.8)):
+        text += f"g {name}\n"
+        for line in low:
+            kind, *rest = line.split()
+            if kind == "v":
+                text += f"v {float(rest[0]) + x} {rest[1]} {float(rest[2]) + 0.1}\n"
+            else:
+                text += "f " + " ".join(f"{int(i) + first}/1" for i in rest) + "\n"
+        first += 8
+    (tmp_path / "b.obj").write_text(text)
+    boxes = load_scene(tmp_path / "b.obj").boxes
+    assert [b.name for b in boxes] == ["a", "b"]
+    np.testing.assert_allclose([b.position[0] for b in boxes], [0.5, 0.8], atol=1e-6)
+
+
+def test_an_obj_with_y_up_is_asked_about_and_never_half_buried(tmp_path, rng):
+    text = obj([1.0, 0.3, 1.2], [0.8, 0.15, 0.0], [0, 0, 0], rng)
+    (tmp_path / "b.obj").write_text(text)
+    with pytest.raises(InputError, match=r"0\.60 m under the ground.*`up: y`"):
+        load_scene(tmp_path / "b.obj")
+    (tmp_path / "s.yaml").write_text("boxes: b.obj\nup: y\n")
+    found = only(tmp_path / "s.yaml")
+    np.testing.assert_allclose(found.position, [0.8, 0.0, 0.15], atol=1e-6)
+    (tmp_path / "s.yaml").write_text("boxes: b.obj\nup: z\n")
+    assert only(tmp_path / "s.yaml").position[2] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_an_obj_of_another_shape_is_named(tmp_path):
+    text = triangulated([1.0, 1.2, 0.2], False) + "v 0 0 0.4\nf 5 6 9\n"
+    (tmp_path / "b.obj").write_text("o rock\n" + text)
+    with pytest.raises(InputError, match=r"rock is '9 corners'.*put boxes in its"):
+        load_scene(tmp_path / "b.obj")
 
 
 def test_a_missing_drawing_is_named(tmp_path):

@@ -13,9 +13,9 @@ import yaml
 
 from clamber.contact.contact import PARTS
 from clamber.errors import InputError
+from clamber.model.boxes import read_obj
 from clamber.model.scene import Scene
 from clamber.model.se3 import matrix_from_rpy
-from clamber.model.terrain import read_obj
 from clamber.recording.demonstration import (
     Demonstration,
     RawTracks,

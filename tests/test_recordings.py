@@ -14,16 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from clamber.contact.contact import ContactInterval
 from clamber.errors import InputError
+from clamber.model.boxes import AXES, to_z_up
 from clamber.model.scene import GROUND, Scene
-from clamber.model.terrain import AXES, to_z_up
 from clamber.recording.bvh import read_bvh
 from clamber.recording.demonstration import (
     Demonstration,
     estimate_offsets,
-    find_levels,
-    fit_levels,
 )
 from clamber.recording.detect import SEAT, detect_contacts
+from clamber.recording.levels import find_levels, fit_levels
 from clamber.recording.points import unique_names
 from clamber.recording.recording import load_demo, read_points
 from clamber.recording.skeleton import recognise, solve_centres

@@ -91,21 +91,6 @@ _MADE_BY = {  # what there is, what is wanted: what makes the one of the other
 }
 
 
-_KINDS = (
-    (b"version https://git-lfs", "a Git LFS pointer: `git lfs pull` brings the file"),
-    (b"<!doctype html", "an HTML page: download the file itself"),
-    (b"<html", "an HTML page: download the file itself"),
-    (b"PK\x03\x04", "a zip archive: unpack it"),
-    (b"\x1f\x8b", "a gzip archive: unpack it"),
-)
-
-
-def in_its_place(head: bytes) -> str | None:
-    """What a file with these first bytes is that stands in another's place, if so."""
-    start = head.lstrip()[:64].lower() if head[:1].isspace() else head[:64].lower()
-    return next((text for mark, text in _KINDS if start.startswith(mark.lower())), None)
-
-
 class MissingDependency(ClamberError):
     """An optional package is absent."""
 
@@ -136,6 +121,87 @@ class Status(enum.Enum):
     BUDGET = "the budget of tries or seconds was spent: allow more"
 
 
+# What a file may be in place of what its name says: how it begins, what that is, and
+# what to do then. The short names are for those who read such files.
+_UNPACK, _SAVE = "unpack it first", "save positions, names and rate as .npz"
+_KINDS: tuple[tuple[str, bytes, str, str], ...] = (
+    ("", b"version https://git-lfs", "a Git LFS pointer", "`git lfs pull` fetches it"),
+    ("", b"/annex/objects/", "a git-annex pointer", "`git annex get` fetches it"),
+    ("", b"<!doctype html", "a web page", "fetch the file itself (Raw, on GitHub)"),
+    ("", b"<html", "a web page", "fetch the file itself (Raw, on GitHub)"),
+    ("", b"404: not found", "what a server says of a missing file", "fetch it again"),
+    ("", b'{"message":', "what a server says of a missing file", "fetch it again"),
+    ("npz", b"PK\x03\x04", "a zip archive", _UNPACK),
+    ("", b"PK\x05\x06", "an empty zip archive", _UNPACK),
+    ("", b"\x1f\x8b", "a gzip archive", _UNPACK),
+    ("", b"BZh", "a bzip2 archive", _UNPACK),
+    ("", b"\xfd7zXZ", "an xz archive", _UNPACK),
+    ("", b"7z\xbc\xaf", "a 7-Zip archive", _UNPACK),
+    ("", b"Rar!", "a RAR archive", _UNPACK),
+    ("", b"(\xb5/\xfd", "a zstd archive", _UNPACK),
+    ("", b"\x89HDF", "an HDF5 or MATLAB file", _SAVE),
+    ("", b"MATLAB 5", "a MATLAB file", _SAVE),
+    ("", b"Kaydara FBX", "an FBX file", "export it as BVH or C3D"),
+    ("", b"; FBX", "an FBX file", "export it as BVH or C3D"),
+    ("", b"glTF", "a glTF file", "export it as BVH, or as OBJ"),
+    ("", b"BLENDER", "a Blender file", "export what it holds"),
+    ("", b"%PDF", "a PDF", ""),
+    ("", b"\x89PNG", "a picture", ""),
+    ("", b"\xff\xd8\xff", "a picture", ""),
+    ("", b"SQLite format", "a database", ""),
+    ("", b"PAR1", "a Parquet file", _SAVE),
+    ("pickle", b"\x80\x02", "a pickle", ""),
+    ("pickle", b"\x80\x03", "a pickle", ""),
+    ("pickle", b"\x80\x04", "a pickle", ""),
+    ("pickle", b"\x80\x05", "a pickle", ""),
+    ("npy", b"\x93NUMPY", "a NumPy array", ""),
+    ("bvh", b"HIERARCHY", "a BVH recording", ""),
+    ("trc", b"PathFileType", "a TRC recording", ""),
+    ("csv", b"Format Version", "a recording of Motive", ""),
+    ("xml", b"<?xml", "XML", ""),
+    ("xml", b"<robot", "a URDF", ""),
+    ("xml", b"<mujoco", "an MJCF", ""),
+    ("xml", b"<sdf", "an SDF", ""),
+    ("", b"ply\n", "a PLY mesh", "save it as OBJ or STL"),
+)
+_START = 512  # [byte] by which a file is told
+
+
+def in_its_place(start: bytes, *own: str) -> str | None:
+    """What a file that begins so plainly is and what to do then; not of `own` kinds."""
+    plain = start.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    for short, begins, what, then in _KINDS:
+        if short not in own and plain.startswith(begins.lower()):
+            return f"{what}: {then}" if then else what
+    return f"a tar archive: {_UNPACK}" if start[257:262] == b"ustar" else None
+
+
+def check_kind(path: Path, expected: str, *own: str) -> bytes:
+    """Refuse a file that is plainly something else, by its first bytes.
+
+    Args:
+        path: The file.
+        expected: What is wanted, for the message: `a scene`.
+        own: Short names of kinds that will do: npz, pickle, npy, bvh, trc, csv, xml.
+
+    Returns:
+        Its first bytes.
+
+    Raises:
+        InputError: It cannot be opened, is empty or of another kind.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(_START)
+    except OSError as e:
+        raise unreadable(path, e) from e
+    if not start:
+        raise InputError(f"{expected}; this file is empty", path)
+    if other := in_its_place(start, *own):
+        raise InputError(f"{expected}; this is {other}", path)
+    return start
+
+
 def read_yaml(path: Path) -> dict:
     """A YAML mapping from disk.
 
@@ -144,10 +210,9 @@ def read_yaml(path: Path) -> dict:
     """
     import yaml  # slow to import, as pydantic below: who catches errors needs neither
 
+    check_kind(path, "YAML")
     try:
         text = path.read_text()
-        if other := in_its_place(text[:256].encode()):
-            raise InputError(f"YAML (it is {other})", path)
         content = yaml.safe_load(text)
     except OSError as e:
         raise unreadable(path, e) from e

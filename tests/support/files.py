@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from clamber.model.boxes import AXES
 from clamber.model.se3 import matrix_from_rpy
-from clamber.model.terrain import AXES
 from clamber.recording.demonstration import Demonstration
 
 

@@ -27,6 +27,7 @@ from clamber.cli.flags import (
     Place,
     PlanningFlags,
     Printed,
+    RecordingFlags,
     RobotName,
     RunFolder,
     SearchFlags,
@@ -72,8 +73,7 @@ class ClimbCommand:
 
     demo: Annotated[str, shown("RECORDING|NAME")] = "climb"
     """A recording, or a built-in demonstration (climb, crossing)."""
-    fit_floor: Switch = False
-    """Correct the heights of the recording's floor and boxes by what rests on them."""
+    recorded: Annotated[RecordingFlags, Flat]
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     contacts: Literal["any", "demonstrated"] = "any"
@@ -99,7 +99,7 @@ class ClimbCommand:
             with self.output.progress(track, more=True) as show:
                 report = clock.watching(show)
                 report("detect", 0.0, "")
-                demo = clamber.load_demo(self.demo, fit_floor=self.fit_floor)
+                demo = self.recorded.load(self.demo, None)
                 sequence = clamber.detect_contacts(demo)
                 report("detect", 1.0, "; ".join(demo.notes[:1]))
                 folder = clamber.new_run_folder(self.out, "climb")
@@ -111,6 +111,8 @@ class ClimbCommand:
                     shown = {"demonstration": (demo, sequence)}
                     drawn = [draw(folder, parts=("plan",), **shown)]
                     done = self.execution.simulate(plan, folder, report, None)
+            usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
+            self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
             code = conclude(self.output, folder, plan, done, clock)
             if done is not None:
                 drawn.append(draw(folder, parts=("climb",)))
@@ -127,8 +129,7 @@ class ContactsCommand:
     """A recording, recording.yaml, or a built-in demonstration by name."""
     scene: Annotated[Path | None, shown("FILE")] = None
     """The scene.yaml it was recorded in, where the recording has none."""
-    fit_floor: Switch = False
-    """Correct the heights of floor and boxes by what rests on them."""
+    recorded: Annotated[RecordingFlags, Flat]
     out: Place = None
     """The run folder (runs/contacts, then runs/contacts-2 ...)."""
     output: Printed
@@ -138,9 +139,7 @@ class ContactsCommand:
         scene = None if self.scene is None else clamber.load_scene(self.scene)
         with self.output.progress(Track("detect")) as report:
             report("detect", 0.0, "")
-            demo = clamber.load_demo(
-                self.recording, scene=scene, fit_floor=self.fit_floor
-            )
+            demo = self.recorded.load(self.recording, scene)
             sequence = clamber.detect_contacts(demo)
             folder = clamber.new_run_folder(self.out, "contacts")
             clamber.save_sequence(sequence, folder / "sequence.json")

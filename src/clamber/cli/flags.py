@@ -87,6 +87,31 @@ RunFolder = Annotated[Path, tyro.conf.Positional, shown("RUN")]
 
 
 @dataclass(frozen=True, kw_only=True)
+class RecordingFlags:
+    """What a recording does not say of itself."""
+
+    fit_floor: bool = False
+    """Correct the heights of floor and boxes by whatever rests on them."""
+    subject: str | None = None
+    """Which person, where several were recorded."""
+    body_model: Annotated[Path | None, shown("FILE")] = None
+    """SMPL's body model (.npz, .pkl), for poses without joints."""
+    demo_robot: Annotated[str | None, shown("NAME|FILE")] = None
+    """Whose motion it is, where it is a robot's: a built-in robot or a robot.yaml."""
+
+    def load(self, path: str, scene: clamber.Scene | None) -> clamber.Demonstration:
+        """The recording."""
+        return clamber.load_demo(
+            path,
+            scene=scene,
+            fit_floor=self.fit_floor,
+            subject=self.subject,
+            body_model=self.body_model,
+            robot=self.demo_robot,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class WorldFlags:
     """Which robot, and where."""
 
@@ -98,7 +123,7 @@ class WorldFlags:
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
     ] = None
-    """A scene.yaml, or boxes as OBJ or MJCF."""
+    """A scene.yaml, or boxes as OBJ, MJCF, URDF or SDF."""
 
     def load(self) -> tuple[clamber.Robot, clamber.Scene]:
         """Robot and scene, the scene first checked as the cheaper one."""

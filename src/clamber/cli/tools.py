@@ -280,7 +280,7 @@ class SceneCommand:
     """Check a scene, say what is in it and, with --out, draw it."""
 
     file: Annotated[Path, tyro.conf.Positional, shown("FILE")]
-    """A scene.yaml, or boxes as OBJ or MJCF."""
+    """A scene.yaml, or boxes as OBJ, MJCF, URDF or SDF."""
     robot: RobotName = "coman"
     """Who stands at its start: a robot by name, or a robot.yaml."""
     out: Annotated[Path | None, shown("DIR")] = None

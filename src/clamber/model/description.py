@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from clamber.errors import InputError, in_its_place, unreadable
+from clamber.errors import InputError, check_kind, in_its_place, unreadable
 from clamber.model.records import short_repr
 from clamber.model.se3 import matrix_from_quat
 
@@ -178,7 +178,7 @@ def _fault(mesh: Path) -> str | None:
             head = f.read(256)
     except OSError as e:
         return f"cannot be read ({e.strerror})"
-    if other := in_its_place(head):
+    if other := in_its_place(head, "xml"):
         return f"is {other}"
     return None if head.strip() else "is empty"
 
@@ -516,9 +516,8 @@ def read_xml(path: Path) -> ElementTree.Element:
     Raises:
         InputError: It is no such file, or too large.
     """
+    check_kind(path, "XML", "xml")
     content = _read_content(path)
-    if other := in_its_place(content[:256]):
-        raise InputError(f"XML (it is {other})", path)
     if b"\0" in content:  # UTF-16 would hide what is looked for next
         raise InputError("XML in UTF-8", path)
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:

@@ -20,8 +20,8 @@ from clamber.errors import InputError
 from clamber.recording.points import (
     MAX_POINTS,
     Points,
-    check_count,
     read_table,
+    say_count,
     unique_names,
 )
 
@@ -60,13 +60,22 @@ def read_bvh(path: Path) -> Points:
     if not blocks:
         raise InputError("rows of numbers", path, f"line {line}")
     position = np.concatenate(blocks)
-    check_count(len(position), count, line, "Frames", path)
     return Points(
-        names=unique_names([j.name for j in joints]),
+        names=unique_names(_names(joints)),
         position=position,
         rate=rate,
         usual_up="y",
+        notes=tuple(say_count(len(position), count, "Frames")),
     )
+
+
+def _names(joints: list[_Joint]) -> list[str]:
+    """Of the joints; where several people share them, after the person's number."""
+    roots = np.cumsum([j.parent < 0 for j in joints])
+    names = [j.name for j in joints]
+    if roots[-1] < 2 or len(set(names)) == len(names):
+        return names
+    return [f"{k}:{n}" for k, n in zip(roots, names, strict=True)]
 
 
 def _read_hierarchy(file: BinaryIO, path: Path) -> tuple[list[_Joint], int, int]:
@@ -127,7 +136,7 @@ def _channel(kind: str, column: int, line: int, path: Path) -> tuple[str, int, i
 
 def _numbers(words: list[str], line: int, path: Path) -> np.ndarray:
     try:
-        x = np.array([float(w) for w in words])
+        x = np.array([float(w.replace(",", ".")) for w in words])
     except ValueError:
         x = np.array([np.nan])
     if not np.isfinite(x).all():

@@ -22,6 +22,7 @@ from clamber.recording.points import MAX_POINTS, Points, unique_names, unit_of
 KEY = 0x50  # second byte of every C3D file
 _BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
+_MOST = 0.9  # of its samples there, a file is read; with fewer it was cut short
 # Results of models that share the list of points with the markers.
 _RESULTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
 _Parameters = dict[tuple[str, str], np.ndarray | list[str]]
@@ -48,8 +49,11 @@ def read_c3d(path: Path) -> Points:
         raise InputError(expected, path, f"byte {start + 3}", processor)
     parameters = _read_parameters(content, start, processor, path)
     header = _Header.read(content, parameters, processor, path)
-    position = _read_samples(content, header, processor, path)
-    names = _labels(parameters, header.points, path)
+    notes: list[str] = []
+    if header.points == 0 and ("ROTATION", "DATA_START") in parameters:
+        return _read_bodies(content, parameters, header, processor, path)
+    position = _read_samples(content, header, processor, path, notes)
+    names = _labels(parameters, header.points, notes)
     results = {n for kind in _RESULTS for n in _words(parameters, kind)}
     keep = [i for i, n in enumerate(names) if n not in results]
     if len(keep) < len(names):
@@ -60,8 +64,61 @@ def read_c3d(path: Path) -> Points:
         names=unique_names(names),
         position=position,
         rate=header.rate,
-        unit=unit_of(units[0], path, "POINT:UNITS") if units and units[0] else None,
+        unit=unit_of(units[0], "POINT:UNITS", notes) if units else None,
         up=_up(parameters),
+        notes=tuple(notes),
+    )
+
+
+def _read_bodies(
+    content: np.ndarray,
+    parameters: _Parameters,
+    header: _Header,
+    processor: int,
+    path: Path,
+) -> Points:
+    """Rigid bodies of a file without points: 4 x 4 matrices, column after column.
+
+    A seventeenth number, negative where the body was not seen, follows each.
+    """
+    notes: list[str] = []
+    names = _words(parameters, "LABELS", "ROTATION")
+    said = {
+        n: _number(parameters, "ROTATION", n)
+        for n in ("USED", "DATA_START", "RATE", "RATIO")
+    }
+    used, block = (
+        int(x) & 0xFFFF if x is not None and np.isfinite(x) else 0
+        for x in (said["USED"], said["DATA_START"])
+    )
+    used = used or len(names)
+    start = (block - 1) * _BLOCK
+    if not 0 < used <= MAX_POINTS or not _BLOCK <= start <= len(content):
+        expected = f"between 1 and {MAX_POINTS} points, or rigid bodies"
+        raise InputError(expected, path, "ROTATION", [used, block])
+    rate = said["RATE"] or header.rate * (said["RATIO"] or 1.0)
+    frames = round(header.frames * rate / header.rate) if header.rate > 0 else 0
+    row = 17 * 4 * used
+    frames = min(frames, (len(content) - start) // row)
+    raw = content[start : start + frames * row]
+    x = _numbers(raw, "f4", processor).reshape(frames, used, 17)
+    # Some programs write rows one after the other: then the last column is 0 0 0 1.
+    by_rows = not np.any(x[..., 12:15]) and np.any(x[..., 3:12:4])
+    matrix = x[..., :16].reshape(frames, used, 4, 4)
+    matrix = matrix if by_rows else np.swapaxes(matrix, 2, 3)
+    position = matrix[..., :3, 3].astype(np.float32)
+    seen = (x[..., 16] >= 0) & np.any(matrix[..., :3, :3] != 0, axis=(2, 3))
+    position[~seen] = np.nan
+    units = _words(parameters, "UNITS", "ROTATION") or _words(parameters, "UNITS")
+    notes.append("no points: the origins of its rigid bodies in their place")
+    names = [*names, *(f"body {k + 1}" for k in range(len(names), used))][:used]
+    return Points(
+        names=unique_names(names),
+        position=position,
+        rate=rate,
+        unit=unit_of(units[0], "UNITS", notes) if units else None,
+        up=_up(parameters),
+        notes=tuple(notes),
     )
 
 
@@ -134,9 +191,9 @@ def _read_value(
     return _numbers(raw, "i2" if kind == 2 else "f4", processor)
 
 
-def _words(parameters: _Parameters, name: str) -> list[str]:
-    """Strings of a parameter of POINT; none where it has none."""
-    value = parameters.get(("POINT", name), [])
+def _words(parameters: _Parameters, name: str, group: str = "POINT") -> list[str]:
+    """Strings of a parameter; none where it has none."""
+    value = parameters.get((group, name), [])
     return value if isinstance(value, list) else []
 
 
@@ -175,12 +232,13 @@ class _Header:
         said = _number(parameters, "POINT", "SCALE")
         scale = scale if said is None or np.isnan(said) else said
         said = _number(parameters, "POINT", "RATE")
-        rate = rate if said is None else said
+        rate = rate if said is None or not said > 0 else said
         start = (int(words[8]) - 1) * _BLOCK
-        if not 0 < points <= MAX_POINTS:
+        rotations = ("ROTATION", "DATA_START") in parameters
+        if not (0 < points or rotations) or points > MAX_POINTS:
             expected = f"between 1 and {MAX_POINTS} points"
             raise InputError(expected, path, "byte 2", points)
-        if frames < 1 or not _BLOCK <= start <= len(content):
+        if frames < 1 or not (_BLOCK <= start <= len(content) or points == 0):
             where, found = "byte 6 (frames), byte 16 (block)", start // _BLOCK + 1
             expected = "samples, after the parameters"
             raise InputError(expected, path, where, [frames, found])
@@ -209,24 +267,31 @@ def _long_frames(parameters: _Parameters) -> int | None:
 
 
 def _read_samples(
-    content: np.ndarray, header: _Header, processor: int, path: Path
+    content: np.ndarray,
+    header: _Header,
+    processor: int,
+    path: Path,
+    notes: list[str],
 ) -> np.ndarray:
     """(T, F, 3) float32, NaN where the fourth word says so or all three are zero."""
     kind = "f4" if header.scale < 0 else "i2"
     width = int(kind[1])
     row = (4 * header.points + header.analog) * width
-    end = header.start + header.frames * row
-    if end > len(content):
-        present = (len(content) - header.start) // row
+    frames, present = header.frames, (len(content) - header.start) // row
+    if present < _MOST * frames:
         expected = (
-            f"{header.frames} samples of {row} bytes each from byte {header.start} on; "
+            f"{frames} samples of {row} bytes each from byte {header.start} on; "
             f"the file ends after {present}"
         )
         raise InputError(expected, path, f"byte {len(content)}")
-    rows = content[header.start : end].reshape(header.frames, row)
-    out = np.empty((header.frames, header.points, 3), dtype=np.float32)
+    if present < frames:
+        notes.append(f"it says {frames} samples and ends after {present}")
+        frames = present
+    end = header.start + frames * row
+    rows = content[header.start : end].reshape(frames, row)
+    out = np.empty((frames, header.points, 3), dtype=np.float32)
     step = max(1, (1 << 22) // row)
-    for k in range(0, header.frames, step):
+    for k in range(0, frames, step):
         block = rows[k : k + step, : 4 * header.points * width]
         x = _numbers(block.ravel(), kind, processor).reshape(len(block), -1, 4)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -239,14 +304,17 @@ def _read_samples(
     return out
 
 
-def _labels(parameters: _Parameters, count: int, path: Path) -> list[str]:
+def _labels(parameters: _Parameters, count: int, notes: list[str]) -> list[str]:
     """Names of the points: LABELS, LABELS2 ... each hold at most 255."""
     labels = _words(parameters, "LABELS")
     k = 2
     while more := _words(parameters, f"LABELS{k}"):
         labels, k = labels + more, k + 1
     if len(labels) < count:
-        raise InputError(f"{count} labels", path, "POINT:LABELS", len(labels))
+        notes.append(
+            f"{count} points have {len(labels)} labels: the others are unnamed"
+        )
+        labels += [f"unnamed {k + 1}" for k in range(len(labels), count)]
     return labels[:count]
 
 
@@ -258,3 +326,12 @@ def _up(parameters: _Parameters) -> str | None:
     words = _words(parameters, "Y_SCREEN")
     axis = words[0].strip().lower().lstrip("+-") if words else ""
     return axis if axis in ("x", "y", "z") else None
+
+
+def is_c3d(start: bytes, path: Path) -> bool:
+    """Whether a file is one, by its second byte and where that sends a reader."""
+    if len(start) < 2 or start[1] != KEY or start[0] < 2:
+        return False
+    with path.open("rb") as file:
+        file.seek((start[0] - 1) * _BLOCK + 3)
+        return file.read(1) in (bytes([p]) for p in (_INTEL, _DEC, _MIPS))

@@ -42,6 +42,7 @@ from clamber.recording.demonstration import (
     runs,
     wrist,
 )
+from clamber.recording.levels import find_floor, say_floor
 
 SEAT = "Seat"
 
@@ -181,8 +182,9 @@ def detect_contacts(
         for interval in _apart(_part_intervals(tracks, part, near, windows))
     ]
     if not found:
-        expected = "at least one contact: check unit, up and the boxes"
-        raise InputError(expected, demo.source)
+        raise InputError(
+            f"at least one contact: {_apart_from_floor(demo)}", demo.source
+        )
     found.sort(key=lambda i: (i.t0, i.part))
     t, stances = _stances(tracks, found)
     seated = [
@@ -197,6 +199,22 @@ def detect_contacts(
         stances=stances,
         t=t,
         intervals=tuple(sorted([*found, *seated], key=lambda i: (i.t0, i.part))),
+    )
+
+
+def _apart_from_floor(demo: Demonstration) -> str:
+    """Why there may be no contact: how far feet and floor are apart, and which way."""
+    floor = find_floor(demo)
+    if floor is not None:
+        return say_floor(floor)
+    feet = [p for s in SIDES for p in demo.points_of(s + "Foot")]
+    seen = demo.valid[:, [demo.names.index(p) for p in feet]]
+    z = np.stack([demo.point(p)[:, 2] for p in feet], axis=1)[seen]
+    if not len(z):
+        return "the feet are never seen"
+    return (
+        f"the feet never rest, and are {np.min(z):.2f} to {np.max(z):.2f} m over the "
+        "floor: check unit, up and the boxes"
     )
 
 

@@ -46,17 +46,19 @@ def read_motive(path: Path) -> Points:
     table = np.concatenate(blocks)
     table = place_rows(table[:, 0], table, first, "Frame", path)
     names = unique_names([name for _, name in columns])
+    notes: list[str] = []
     return Points(
         names=names,
         position=table[:, np.array([c["Position"] for c in columns.values()])],
         rate=_rate(said, path),
-        unit=unit_of(said.get("length units", "meters"), path, "line 1, Length Units"),
+        unit=unit_of(said.get("length units", "meters"), "Length Units", notes),
         up="y",
         orientation={
             n: table[:, c["Rotation"]]
             for n, c in zip(names, columns.values(), strict=True)
             if "Rotation" in c
         },
+        notes=tuple(notes),
     )
 
 
@@ -85,6 +87,11 @@ def _read_heading(
             rows[cells[1].strip().lower()] = cells
         before = cells
     expected = "`Format Version` first, and later a line that begins with Frame,Time"
+    if not said:
+        expected = (
+            "Motive's CSV, which begins with `Format Version`; of another table save "
+            "positions (T, F, 3), names and rate as .npz"
+        )
     raise InputError(expected, path, f"line {_LINES if said else 1}")
 
 

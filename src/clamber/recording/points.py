@@ -31,9 +31,9 @@ METRES = {
     "dm": 0.1,
     "cm": 0.01, "centimeters": 0.01, "centimetres": 0.01,
     "mm": 0.001, "millimeters": 0.001, "millimetres": 0.001,
-    "um": 1e-6, "micrometers": 1e-6,
+    "um": 1e-6, "µm": 1e-6, "micrometers": 1e-6,
     "in": 0.0254, "inch": 0.0254, "inches": 0.0254,
-    "ft": 0.3048, "feet": 0.3048,
+    "ft": 0.3048, "foot": 0.3048, "feet": 0.3048,
 }  # fmt: skip
 
 
@@ -50,6 +50,9 @@ class Points:
         usual_up: What is usual for this format, where the file does not say.
         orientation: (T, 4) wxyz of rigid bodies and bones by name, in the file's axes;
             NaN where they are not seen.
+        offsets: Heights of points over what their parts rest on, by kind, where they
+            are known [m].
+        notes: What is odd about the file, and what was made of it.
     """
 
     names: tuple[str, ...]
@@ -59,6 +62,8 @@ class Points:
     up: str | None = None
     usual_up: str = "z"
     orientation: Mapping[str, np.ndarray] = field(default_factory=dict)
+    offsets: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -91,17 +96,26 @@ def read_safely(read: Callable[[Path], Points], path: Path) -> Points:
     return points
 
 
-def unit_of(word: str, source: Path, field: str) -> float:
+def unit_of(word: str, where: str, notes: list[str]) -> float | None:
     """Metres per unit, by the word that a file uses for it.
 
-    Raises:
-        InputError: It is no unit of length.
+    Args:
+        word: Such as `mm`, `[mm]`, `Millimeters`; empty where there is none.
+        where: It is said, for the note.
+        notes: Is told of a word that is no unit of length.
+
+    Returns:
+        None where the word is none, so that the person tells.
     """
-    plain = word.strip().strip("\0").lower()
-    if plain not in METRES:
-        expected = "a unit of length such as m, cm, mm or inches"
-        raise InputError(expected, source, field, word)
-    return METRES[plain]
+    plain = re.sub(r"[\s\[\]().\"'\0]", "", word.lower())
+    plain = plain if plain in METRES else plain + "s"  # millimeter
+    if plain != "s" and plain not in METRES:
+        notes.append(f"{where}: {_printed(word)!r} is no unit of length, not heeded")
+    return METRES.get(plain)
+
+
+def _printed(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)[:20]
 
 
 def unique_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -131,16 +145,24 @@ _ROW = re.compile(r"at row (\d+)(?:, column (\d+))?")  # in what NumPy says is w
 
 
 def read_table(
-    file: BinaryIO, columns: int, delimiter: str | None, line: int, source: Path
+    file: BinaryIO,
+    columns: int,
+    delimiter: str | None,
+    line: int,
+    source: Path,
+    *,
+    ragged: bool = False,
 ) -> Iterator[np.ndarray]:
     """Blocks (N, columns) of numbers until the end of the file.
 
     Args:
         file: Open at the start of the first row.
-        columns: How many numbers a row has; one delimiter more at its end is allowed.
-        delimiter: One character, or None for any white space.
+        columns: How many numbers a row has; empty cells at its end are not counted.
+        delimiter: One character, or None for any white space. Where it is no comma,
+            numbers may have one in place of the point.
         line: Number of the first row's line, for messages.
         source: The file's name, for messages.
+        ragged: Whether a row may lack points, of three cells each, at its end.
 
     Yields:
         Arrays of float; a cell that is empty is NaN.
@@ -154,7 +176,7 @@ def read_table(
         block += file.readline()
         lines = block.replace(b"\r", b"").split(b"\n")
         rows = {
-            number: _filled(text, columns, gap)
+            number: _filled(text, columns, gap, ragged)
             for number, text in enumerate(lines, line)
             if text.strip()
         }
@@ -163,16 +185,22 @@ def read_table(
             yield _parsed(rows, columns, delimiter, source)
 
 
-def _filled(text: bytes, columns: int, gap: bytes) -> bytes:
-    """A row without a delimiter too many, `nan` in its empty cells."""
+def _filled(text: bytes, columns: int, gap: bytes, ragged: bool) -> bytes:
+    """A row of as many cells as there are columns, `nan` in its empty ones."""
+    if gap != b",":
+        text = text.replace(b",", b".")
     if not gap:
         return text
-    if text.endswith(gap) and text.count(gap) == columns:
-        text = text[: -len(gap)]
+    while text.count(gap) >= columns and (rest := text.rstrip(b" ")).endswith(gap):
+        text = rest[: -len(gap)]
     for _ in range(2):  # cells side by side
         text = text.replace(gap + gap, gap + b"nan" + gap)
     text = b"nan" + text if text.startswith(gap) else text
-    return text + b"nan" if text.endswith(gap) else text
+    text = text + b"nan" if text.endswith(gap) else text
+    lacking = columns - 1 - text.count(gap)
+    if ragged and lacking > 0 and lacking % 3 == 0:
+        text += lacking * (gap + b"nan")
+    return text
 
 
 def _parsed(
@@ -239,12 +267,8 @@ def place_rows(
     return out
 
 
-def check_count(found: int, said: float, line: int, what: str, source: Path) -> None:
-    """Refuse a file that ends before its heading says so.
-
-    Raises:
-        InputError: There are fewer rows than `said`, from `line` on.
-    """
-    if not found >= said:
-        expected = f"{said:g} rows, as {what} says; the file ends after {found}"
-        raise InputError(expected, source, f"line {line + found}")
+def say_count(found: int, said: float, what: str) -> list[str]:
+    """A note on a file whose heading promises another count of rows than it has."""
+    if found == said:
+        return []
+    return [f"{what} says {said:g}, the file has {found} rows"]

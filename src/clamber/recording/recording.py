@@ -18,11 +18,12 @@ from typing import Annotated, Literal
 import numpy as np
 import pydantic
 
-from clamber.errors import InputError, read_yaml, unreadable, validated
+from clamber.errors import InputError, check_kind, read_yaml, unreadable, validated
 from clamber.model.arguments import checks_types
+from clamber.model.boxes import read_obj, to_z_up
 from clamber.model.scene import Box, Scene
-from clamber.model.se3 import matrix_from_quat
-from clamber.model.terrain import SceneLike, load_scene, read_obj, to_z_up
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy
+from clamber.model.terrain import DRAWN, SceneLike, load_scene
 from clamber.recording import arrays, bvh, c3d, motive, trc
 from clamber.recording.built_in import BUILT_IN, load_built_in
 from clamber.recording.demonstration import (
@@ -31,8 +32,8 @@ from clamber.recording.demonstration import (
     Demonstration,
     RawTracks,
     build_demonstration,
-    fit_levels,
 )
+from clamber.recording.levels import fit_levels, settle
 from clamber.recording.points import MAX_RATE, METRES, Points, read_safely
 from clamber.recording.skeleton import (
     Recognised,
@@ -46,16 +47,19 @@ Rate = Annotated[float, pydantic.Field(gt=0.0, le=MAX_RATE, allow_inf_nan=False)
 Seconds = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
 Name = Annotated[str, pydantic.Field(min_length=1)]
 Metres = Annotated[float, pydantic.Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
+Far = Annotated[float, pydantic.Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)]
+Angle = Annotated[float, pydantic.Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 Scale = Annotated[float, pydantic.Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
 
 # Suffix, what the content begins with and at which byte, and the reader.
-_READERS: tuple[tuple[tuple[str, ...], int, bytes, Callable[[Path], Points]], ...] = (
+_READERS: tuple[tuple[tuple[str, ...], int, bytes, Callable[..., Points]], ...] = (
     ((".c3d",), 1, bytes([c3d.KEY]), c3d.read_c3d),
     ((".trc",), 0, trc.MAGIC, trc.read_trc),
     ((".bvh",), 0, bvh.MAGIC, bvh.read_bvh),
     ((".csv",), 0, motive.MAGIC, motive.read_motive),
     ((".npy",), 0, arrays.NPY_MAGIC, arrays.read_array),
     ((".npz",), 0, arrays.NPZ_MAGIC, arrays.read_array),
+    ((".pkl", ".pickle"), 0, b"\x80", arrays.read_pickled),
 )
 YAML = (".yaml", ".yml")
 FLOOR = "floor"
@@ -83,7 +87,11 @@ class RecordingFile(pydantic.BaseModel):
     rate: Rate | None = None
     unit: str | Scale | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    offset: Far | tuple[Far, Far, Far] | None = None
+    rotation: tuple[Angle, Angle, Angle] | None = None
     subject: Name | None = None
+    body_model: Name | None = None
+    robot: Name | None = None
     boxes: Name | None = None
     ground: Name = FLOOR
     span: tuple[Seconds, Seconds] | None = None
@@ -136,19 +144,28 @@ def load_demo(
     rate: float | None = None,
     span: tuple[float, float] | None = None,
     fit_floor: bool = False,
+    subject: str | None = None,
+    body_model: str | Path | None = None,
+    robot: str | Path | None = None,
 ) -> Demonstration:
     """Read a recording, or take a built-in one by its name.
 
     Args:
         path_or_name: `climb` or `crossing` for a built-in synthetic one, a
-            `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, or an array
-            (`.npy`, or `.npz` with `positions`, `names` and `rate`).
+            `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, an array
+            (`.npy`, or `.npz` with `positions`, `names` and `rate`), or the motion of a
+            body or a robot (`.npz`, `.pkl`).
         scene: Replaces the boxes of the recording, in its coordinates.
         names: Of the columns of a bare array: a list, or a JSON file with one.
         rate: Of a bare array, or in place of the file's own [Hz].
         span: Part of the recording to keep [s]; of a `recording.yaml`, its own by
             default.
-        fit_floor: Correct the heights of floor and boxes by what rests on them.
+        fit_floor: Correct the heights of floor and boxes by whatever rests on them, not
+            only where the floor is off beyond doubt.
+        subject: Which person, where several were recorded.
+        body_model: SMPL's, SMPL-H's or SMPL-X's file, for poses without joints.
+        robot: Whose motion it is, where it is a robot's: a built-in one by name, or a
+            robot.yaml.
 
     Raises:
         InputError: The name is unknown, or the file, or one that it names, or a field
@@ -157,7 +174,8 @@ def load_demo(
     path = Path(path_or_name)
     if str(path_or_name) in BUILT_IN:
         demo = load_built_in(str(path_or_name))
-    elif path.suffix.lower() in SUFFIXES or path.is_file():
+        return fit_levels(demo) if fit_floor else demo
+    if path.suffix.lower() in SUFFIXES or path.is_file():
         if path.suffix.lower() in YAML:
             given = read_yaml(path)
         else:
@@ -167,19 +185,34 @@ def load_demo(
                 names = list(names)
             given = {"file": path.name, "names": names, "rate": rate}
         said = validated(RecordingFile, given, path)
+        more = {"subject": subject}
+        if body_model is not None:
+            more["body_model"] = str(Path(body_model).absolute())
+        if robot is not None:
+            is_file = Path(robot).suffix != ""
+            more["robot"] = str(Path(robot).absolute() if is_file else robot)
+        more = {k: v for k, v in more.items() if v is not None}
+        said = said.model_copy(update=more) if more else said
         given = None if scene is None else load_scene(scene)
         demo = _build(path, said, given, span or said.span)
-    else:
-        expected = (
-            f"one of the built-in demonstrations {list(BUILT_IN)} or a file "
-            f"that ends in {', '.join(SUFFIXES)}"
-        )
-        raise InputError(expected, "recording", value=str(path_or_name))
-    return fit_levels(demo) if fit_floor else demo
+        if fit_floor:
+            return fit_levels(demo)
+        return demo if said.offset is not None else settle(demo)
+    expected = (
+        f"one of the built-in demonstrations {list(BUILT_IN)} or a file "
+        f"that ends in {', '.join(SUFFIXES)}"
+    )
+    raise InputError(expected, "recording", value=str(path_or_name))
 
 
 def read_points(
-    path: Path, *, names: Sequence[str] | None = None, rate: float | None = None
+    path: Path,
+    *,
+    names: Sequence[str] | None = None,
+    rate: float | None = None,
+    subject: str | None = None,
+    body_model: Path | None = None,
+    robot: str | None = None,
 ) -> Points:
     """Named points of a file, by the reader that its content, or its suffix, calls for.
 
@@ -187,29 +220,35 @@ def read_points(
         path: The file.
         names: Of the columns of a bare array.
         rate: In place of the file's own, where it has one [Hz].
+        subject: Which of several motions in a pickle.
+        body_model: SMPL's file, for poses without joints.
+        robot: Whose motion it is, where it is a robot's.
 
     Raises:
         InputError: No reader knows such a file, or it is damaged.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError as e:
-        raise unreadable(path, e) from e
+    start = check_kind(path, "a recording", "npz", "npy", "bvh", "trc", "csv", "pickle")
     plain = start.lstrip(b'\xef\xbb\xbf" \t\r\n')
     by_content = [
         r for _, at, magic, r in _READERS
         if (plain if at == 0 else start)[at:].startswith(magic)
     ]  # fmt: skip
     by_suffix = [r for suffixes, *_, r in _READERS if path.suffix.lower() in suffixes]
-    # One byte tells little, so that a C3D file must also be called one.
-    certain = [r for r in by_content if r is not c3d.read_c3d or r in by_suffix]
+    # One byte tells little: a C3D file must be called one or send us to its parameters.
+    certain = [
+        r
+        for r in by_content
+        if r is not c3d.read_c3d or r in by_suffix or c3d.is_c3d(start, path)
+    ]
     reader = next(iter([*certain, *by_suffix]), None)
     if reader is None:
         kinds = ", ".join(s for s in SUFFIXES if s not in YAML)
         raise InputError(f"a recording: {kinds}", path)
-    if reader is arrays.read_array:
-        reader = partial(arrays.read_array, names=names, rate=rate)
+    if reader in (arrays.read_array, arrays.read_pickled):
+        given = arrays.Given(
+            names=names, rate=rate, subject=subject, body_model=body_model, robot=robot
+        )
+        reader = partial(reader, given=given)
     points = read_safely(reader, path)
     return points if rate is None else replace(points, rate=rate)
 
@@ -223,7 +262,15 @@ def _build(
     """The record, in the coordinates in which the chosen ground is z = 0."""
     folder = path.parent
     names = _read_names(said.names, folder, path) if said.names else None
-    points = read_points(folder / said.file, names=names, rate=said.rate)
+    robot = said.robot
+    points = read_points(
+        folder / said.file,
+        names=names,
+        rate=said.rate,
+        subject=said.subject,
+        body_model=folder / said.body_model if said.body_model else None,
+        robot=str(folder / robot) if robot and Path(robot).suffix else robot,
+    )
     first, last = _span(span, len(points.position), points.rate, path)
     labels, fixed = list(points.names), {}
     parts: dict[str, str | list[str]] = {}
@@ -235,7 +282,9 @@ def _build(
             labels.append(label)
         else:
             parts[part] = what
-    found = recognise(labels, parts=parts, subject=said.subject, source=path)
+    is_pickle = Path(said.file).suffix.lower() in (".pkl", ".pickle")
+    subject = None if is_pickle else said.subject  # it has chosen the motion already
+    found = recognise(labels, parts=parts, subject=subject, source=path)
     with np.errstate(invalid="ignore"):  # NaN of any kind
         raw = {
             c: points.position[first:last, c].astype(float)
@@ -246,11 +295,20 @@ def _build(
     for column, what in fixed.items():
         raw[column] = _fixed(points, what, unit, path)[first:last]
     up, why_up = _up(said, points, found, raw)
+    R, offset = _moved(said)
     track = {c: unit * to_z_up(x, up) for c, x in raw.items()}
+    if R is not None:
+        track = {c: x @ R.T + offset for c, x in track.items()}
     solved = solve_centres(found, track)
     position = np.stack(list(solved.values()), axis=1)
 
     given = _boxes(said, folder, unit, up) if scene is None else scene
+    if R is not None and scene is None and (said.boxes or "").lower().endswith(".obj"):
+        turned = [
+            replace(b, position=R @ b.position + offset, rotation=R @ b.rotation)
+            for b in given.boxes
+        ]
+        given = replace(given, boxes=tuple(turned))
     boxes, level = lower_to_ground(given.boxes, said.ground, path)
     position[..., 2] -= level
     start = _start(position, list(solved))
@@ -263,15 +321,26 @@ def _build(
             t0=first / points.rate,
             scene=replace(given, boxes=boxes, start=start, goal=None),
             max_gap=said.max_gap,
-            offsets=said.offsets or {},
+            offsets={**points.offsets, **(said.offsets or {})},
             raised=found.raised,
             notes=(
                 f"recognised: {found.name} ({len(points.names)} points at "
                 f"{points.rate:g} Hz)",
                 f"unit: {unit:g} m ({why_unit}); up: {up} ({why_up})",
+                *points.notes,
             ),
         )
     )
+
+
+def _moved(said: RecordingFile) -> tuple[np.ndarray | None, np.ndarray]:
+    """Rotation (3, 3) and offset (3,) of what was recorded; None for neither."""
+    if said.offset is None and said.rotation is None:
+        return None, np.zeros(3)
+    offset = (0.0, 0.0, 0.0) if said.offset is None else said.offset
+    if isinstance(offset, float):
+        offset = (0.0, 0.0, offset)
+    return matrix_from_rpy(said.rotation or (0.0, 0.0, 0.0)), np.array(offset)
 
 
 # Where a file does not say its unit the shank does: no two of these agree.
@@ -416,10 +485,11 @@ def _boxes(said: RecordingFile, folder: Path, unit: float, up: str) -> Scene:
     if said.boxes is None:
         return Scene(start=np.zeros(3))
     path = folder / said.boxes
-    if path.suffix.lower() in YAML:
+    if path.suffix.lower() in (*YAML, *DRAWN) and path.suffix.lower() != ".obj":
         return load_scene(path)
     if path.suffix.lower() != ".obj":
-        raise InputError("an .obj or a scene.yaml", path, "boxes")
+        expected = f"a scene.yaml, or boxes as {', '.join(DRAWN)}"
+        raise InputError(expected, path, "boxes")
     return Scene(boxes=tuple(read_obj(path, unit, up)), start=np.zeros(3))
 
 

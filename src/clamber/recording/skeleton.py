@@ -10,7 +10,6 @@ Shapes: T samples.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -20,106 +19,22 @@ from clamber.contact.contact import PARTS
 from clamber.errors import InputError
 from clamber.model.records import short_repr
 from clamber.recording.demonstration import REQUIRED, SIDES
-
-# Skeletons.
-
-# Canonical point: names in order of preference, lower case without separators, after
-# `left` or `l` (either side alike). The ankle is the reference point of a foot.
-_SIDED = {
-    "Hand": ("wrist", "hand", "wristjoint"),
-    "Hand.knuckle": (
-        "handmiddle1", "middle1", "middle01", "knuckle", "hand.knuckle",
-        "fingerbase", "hand",
-    ),
-    "Hand.tip": (
-        "handmiddle3", "middle3", "middle03", "tip", "hand.tip", "handindex1end",
-        "handend", "fingers",
-    ),
-    "Hand.thumb": ("handthumb3", "thumb3", "thumb03", "thumb", "hand.thumb"),
-    "Elbow": ("elbow", "forearm", "farm", "elbowjoint", "lowerarm", "radius"),
-    "Shoulder": ("arm", "uarm", "upperarm", "humerus", "shoulder", "shoulderjoint"),
-    "Hip": ("upleg", "femur", "hip", "thigh", "hipjoint"),
-    "Knee": ("knee", "leg", "tibia", "kneejoint", "calf", "shin"),
-    "Foot": ("ankle", "foot", "anklejoint"),
-    "Foot.toe": ("toebase", "toe", "toes", "foot.toe", "ball", "foot", "footend"),
-}  # fmt: skip
-_PREFIXES = {"L": ("left", "l"), "R": ("right", "r")}
-_MIDDLE = {
-    "Pelvis": ("pelvis", "hips", "hip", "root"),
-    "Head": ("head",),
-    "Neck": ("neck", "neck1", "lowerneck"),
-}
-# What a skeleton is called, by names (lower case, no separators) that no other has.
-_SIGNATURES = (
-    ("Motive skeleton", ("luarm", "lfarm", "lshin")),
-    ("SMPL joints", ("leftcollar", "spine3", "leftwrist")),
-    ("CMU skeleton", ("lhipjoint", "leftupleg", "lowerback")),
-    ("CMU skeleton", ("lfemur", "ltibia", "lhumerus")),
-    ("LAFAN skeleton", ("leftupleg", "lefttoe", "spine2")),
-    ("Mixamo-like skeleton", ("leftupleg", "leftforearm", "hips")),
-    ("clamber's own points", ("lhand", "lelbow", "lfoot.toe")),
+from clamber.recording.names import (
+    JOINTS,
+    MIDDLE,
+    PLACES,
+    plain_name,
+    prefixes_of,
+    read_names,
+    set_name,
 )
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MarkerSet:
-    """Which marker lies where; `{s}` is L or R.
-
-    Each place has alternatives; the first whose markers all exist counts, and is their
-    mean. `raised`: a marker on top of a bone is so much higher than its centre [m].
-    """
-
-    name: str
-    places: Mapping[str, tuple[tuple[str, ...], ...]]
-    raised: Mapping[str, float] = field(
-        default_factory=lambda: {"Foot.toe": 0.02, "Hand.knuckle": 0.02}
-    )
-
-
+# What is needed of a set of markers; `raised`: a marker on top of a bone is so much
+# higher than its centre [m].
 _NEEDED = ("Asis", "Psis", "KneeOut", "AnkleOut", "Acromion", "ElbowOut", "Wrist")
-MARKER_SETS = (
-    MarkerSet(
-        name="Plug-in Gait",
-        places={
-            "Asis": (("{s}ASI",), ("{s}ASIS",)),
-            "Psis": (("{s}PSI",), ("{s}PSIS",), ("SACR",)),
-            "KneeOut": (("{s}KNE",),),
-            "KneeIn": (("{s}KNM",), ("{s}KNEM",), ("{s}MKNE",)),
-            "AnkleOut": (("{s}ANK",),),
-            "AnkleIn": (("{s}ANM",), ("{s}ANKM",), ("{s}MMED",), ("{s}MED",)),
-            "Toe": (("{s}TOE",),),
-            "Acromion": (("{s}SHO",),),
-            "ElbowOut": (("{s}ELB",),),
-            "ElbowIn": (("{s}ELBM",), ("{s}MELB",)),
-            "Wrist": (("{s}WRA", "{s}WRB"),),
-            "HandBack": (("{s}FIN",),),
-            "Head": (("LFHD", "RFHD", "LBHD", "RBHD"),),
-            "Neck": (("C7",),),
-        },
-    ),
-    MarkerSet(
-        name="Motive Baseline",
-        places={
-            "Asis": (("Waist{s}Front",),),
-            "Psis": (("Waist{s}Back",),),
-            "KneeOut": (("{s}KneeOut",),),
-            "KneeIn": (("{s}KneeIn",),),
-            "AnkleOut": (("{s}AnkleOut",),),
-            "AnkleIn": (("{s}AnkleIn",),),
-            "Toe": (
-                ("{s}ToeIn", "{s}ToeOut"), ("{s}ForefootIn", "{s}ForefootOut"),
-                ("{s}ToeOut",), ("{s}ForefootOut",), ("{s}ToeTip",),
-            ),
-            "Acromion": (("{s}ShoulderTop",),),
-            "ElbowOut": (("{s}ElbowOut",),),
-            "ElbowIn": (("{s}ElbowIn",),),
-            "Wrist": (("{s}WristIn", "{s}WristOut"),),
-            "HandBack": (("{s}HandIn", "{s}HandOut"), ("{s}HandOut",)),
-            "Head": (("HeadTop",),),
-            "Neck": (("BackTop",), ("SpineTop",)),
-        },
-    ),
-)  # fmt: skip
+_RAISED = {"Foot.toe": 0.02, "Hand.knuckle": 0.02}
+_POINTS = (*PARTS, *REQUIRED, *MIDDLE, "LWrist", "RWrist")  # that `parts` may name
+_SIDED_PLACES = tuple(p for p in PLACES if p not in MIDDLE)
 
 MARKER_RADIUS = 0.007  # [m] of the usual 14 mm balls
 # Half the width of a joint, as a share of the segment that ends there.
@@ -173,126 +88,127 @@ def recognise(
     given: dict[str, tuple[int, ...]] = {}
     for point, wanted in (parts or {}).items():
         several = [wanted] if isinstance(wanted, str) else list(wanted)
-        for k, name in enumerate(several):
+        for name in several:
             if name not in index:
                 expected = f"one of the names of the recording: {_listed(names)}"
                 raise InputError(expected, source, f"parts.{point}", name)
-            given[point if k == 0 else f"{point}.{k}"] = (index[name],)
-    prefixes = _prefixes(names)
+        columns = [index[name] for name in several]
+        if _is_place(point):
+            given[point] = tuple(columns)
+            continue
+        for k, column in enumerate(columns):
+            given[point if k == 0 else f"{point}.{k}"] = (column,)
+    prefixes = prefixes_of(names)
     if subject is not None:
-        prefixes = [p for p in prefixes if p[:-1] == subject]
+        prefixes = [p for p in prefixes if f":{_person(p)}".endswith(f":{subject}")]
         if not prefixes:
             expected = f"the beginning of names such as {_listed(names)}"
             raise InputError(expected, source, "subject", subject)
     complete: dict[str, Recognised] = {}
-    missing: list[str] = []
+    incomplete: list[tuple[list[str], Recognised]] = []
     for prefix in prefixes:
-        found = _recognise_one(names, prefix, given)
-        lacking = [p for p in REQUIRED if p not in found.columns and p != "Pelvis"]
-        if found.on_skin or not lacking:
+        found, lacking = _recognise_one(names, prefix, given)
+        if lacking:
+            incomplete.append((lacking, found))
+        elif not any(p.startswith(prefix) for p in complete):  # of a person found
             complete[prefix] = found
             if prefix == "":
                 break
-        elif not missing or len(lacking) < len(missing):
-            missing = lacking
     if len(complete) > 1:
-        people = sorted(p[:-1] for p in complete)
+        people = sorted(_person(p) for p in complete)
         raise InputError(f"which person is meant: one of {people}", source, "subject")
     if not complete:
+        lacking, found = min(incomplete, key=lambda x: len(x[0]))
+        taken = {c for columns in found.columns.values() for c in columns}
+        left = [n for i, n in enumerate(names) if i not in taken]
+        over = f"left over are {_listed(left, 24)}" if left else "no name is left over"
         expected = (
-            f"a joint or markers for each of {', '.join(missing)}: name them under "
-            f"`parts`; the recording has {_listed(names)}"
+            f"a joint or markers for {', '.join(lacking)}: name them under `parts` of "
+            f"a recording.yaml; {over}"
         )
         raise InputError(expected, source, "names")
     return next(iter(complete.values()))
 
 
 def known_point(point: str) -> bool:
-    """Whether `parts` may name this point."""
-    base = point.split(".")[0]
-    return base in {*PARTS, *REQUIRED, *_MIDDLE, "LWrist", "RWrist"}
+    """Whether `parts` may name this point, or place on the skin."""
+    return point.split(".")[0] in _POINTS or _is_place(point)
 
 
-_MANY = 8  # names that begin alike before it is a person's name
+def _is_place(point: str) -> bool:
+    """Whether it is a place of markers only, such as `LKneeOut`."""
+    return point[:1] in SIDES and point[1:] in _SIDED_PLACES and point not in _POINTS
 
 
-def _prefixes(names: Sequence[str]) -> list[str]:
-    """Beginnings that many names share, up to a colon or an underscore; first none."""
-    count: dict[str, int] = {"": len(names)}
-    for name in names:
-        for end in {name.rfind(":"), name.find("_"), name.find(":")} - {-1}:
-            count[name[: end + 1]] = count.get(name[: end + 1], 0) + 1
-    return [p for p, n in count.items() if n >= _MANY or not p]
+def _person(prefix: str) -> str:
+    return prefix.rstrip(" _.-:/|#")
 
 
 def _recognise_one(
     names: Sequence[str], prefix: str, given: Mapping[str, tuple[int, ...]]
-) -> Recognised:
-    """What one person's names mean, complete or not."""
+) -> tuple[Recognised, list[str]]:
+    """What one person's names mean, and what is lacking."""
     own = {n[len(prefix) :]: i for i, n in enumerate(names) if n.startswith(prefix)}
-    plain: dict[str, int] = {}
-    for n, i in own.items():
-        plain.setdefault(re.sub(r"[\s_\-:]", "", n).lower(), i)
-    joints = _joints(plain, given)
-    if all(p in joints for p in REQUIRED if p != "Pelvis"):
-        called = [n for n, words in _SIGNATURES if all(w in plain for w in words)]
-        name = next(iter(called), "joints by their names")
-        return Recognised(name=name + " and `parts`" * bool(given), columns=joints)
-    for markers in MARKER_SETS:
-        columns = _places(markers, own)
-        if all(s + p in columns for p in _NEEDED for s in SIDES):
-            return Recognised(
-                name=f"{markers.name} markers" + " and `parts`" * bool(given),
-                columns={**columns, **given},
-                on_skin=True,
-                raised=markers.raised,
-            )
-    return Recognised(name="", columns=joints)
+    said, plain = read_names(own)
+    more = " and `parts`" * bool(given)
+    columns = _joints(said, {p: c for p, c in given.items() if not _is_place(p)})
+    name = set_name("joints", [*plain, *map(plain_name, names)]) + more
+    joints = Recognised(name=name, columns=columns)
+    lacking = [p for p in REQUIRED if p not in columns and p != "Pelvis"]
+    if not lacking:
+        return joints, []
+    columns = {**_places(said), **given}
+    name = set_name("markers", list(plain)) + more
+    markers = Recognised(name=name, columns=columns, on_skin=True, raised=_RAISED)
+    wanted = [s + p for s in SIDES for p in _NEEDED if s + p not in columns]
+    if len(wanted) < len(lacking) or not wanted:
+        return markers, wanted
+    return joints, lacking
 
 
 def _joints(
-    plain: Mapping[str, int], given: Mapping[str, tuple[int, ...]]
+    said: Mapping[str, Mapping[str, int]], given: Mapping[str, tuple[int, ...]]
 ) -> dict[str, tuple[int, ...]]:
     """Columns of canonical points, as many as the names tell."""
     columns = dict(given)
     given_parts = {p.split(".")[0] for p in given}
-    for side, prefixes in _PREFIXES.items():
-        for point, words in _SIDED.items():
+    for side in SIDES:
+        for point, words in JOINTS.items():
             if (side + point).split(".")[0] in given_parts:
                 continue
             taken = {c for several in columns.values() for c in several}
-            candidates = (plain.get(p + w, -1) for w in words for p in prefixes)
+            candidates = (said[side].get(w, -1) for w in words)
             found = next((c for c in candidates if c >= 0 and c not in taken), None)
             if found is not None:
                 columns[side + point] = (found,)
-    for point, words in _MIDDLE.items():
-        found = next((plain[w] for w in words if w in plain), None)
+    for point, words in MIDDLE.items():
+        found = next((said[""][w] for w in words if w in said[""]), None)
         if point not in columns and found is not None:
             columns[point] = (found,)
-    for side, prefixes in _PREFIXES.items():
-        words = (p + w for w in _SIDED["Hand"] for p in prefixes)
-        found = next((plain[w] for w in words if w in plain), None)
+    for side in SIDES:
+        words = (w for w in JOINTS["Hand"] if w in said[side])
+        found = next((said[side][w] for w in words), None)
         if found is not None and (found,) != columns.get(side + "Hand"):
             columns.setdefault(side + "Wrist", (found,))  # the hand was named otherwise
     return columns
 
 
-def _places(markers: MarkerSet, own: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
-    """Columns of the places of a marker set, as many as there are."""
+def _places(said: Mapping[str, Mapping[str, int]]) -> dict[str, tuple[int, ...]]:
+    """Columns of the places on the skin, as many as there are."""
     columns: dict[str, tuple[int, ...]] = {}
-    for place, alternatives in markers.places.items():
-        for side in SIDES if any("{s}" in a[0] for a in alternatives) else ("",):
+    for place, alternatives in PLACES.items():
+        for side in ("",) if place in MIDDLE else SIDES:
             for several in alternatives:
-                wanted = [n.format(s=side) for n in several]
-                if all(n in own for n in wanted):
-                    columns[side + place] = tuple(own[n] for n in wanted)
+                words = [("" if w[0] == "*" else side, w.lstrip("*")) for w in several]
+                if all(w in said[s] for s, w in words):
+                    columns[side + place] = tuple(said[s][w] for s, w in words)
                     break
     return columns
 
 
-def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(names[:12])
-    return shown if len(names) <= 12 else f"{shown} ... ({len(names)})"
+def _listed(names: Sequence[str], most: int = 12) -> str:
+    shown = ", ".join(names[:most])
+    return shown if len(names) <= most else f"{shown} ... ({len(names)})"
 
 
 # Joint centres.
@@ -342,7 +258,8 @@ def _centres(at: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     for point in ("Head", "Neck"):
         if point in at:
             out[point] = at[point]
-    out |= {p: x for p, x in at.items() if known_point(p) and p not in ("Head", "Neck")}
+    own = (p for p in at if p.split(".")[0] in _POINTS and p not in ("Head", "Neck"))
+    out |= {p: at[p] for p in own}
     return out
 
 

@@ -29,7 +29,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from clamber.errors import InputError, unreadable
+from clamber.errors import InputError, check_kind, unreadable
 
 VERSION = 2
 _PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
@@ -420,7 +420,10 @@ def read_json(path: Path, *, maker: str, versions: Collection[int] = (VERSION,))
     except OSError as e:
         raise unreadable(path, e, maker) from e
     except ValueError as e:
+        check_kind(path, "a JSON file")
         raise InputError(f"a JSON file ({e}); {maker}", path) from e
+    if text:
+        check_kind(path, "a JSON file")
     at = At(parse(text, At(None, path), maker), path)
     version = at.object().get("version", "absent")
     if version not in versions:

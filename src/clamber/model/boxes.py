@@ -1,0 +1,438 @@
+"""Boxes that are drawn: files of other programs -> `Box` records.
+
+An OBJ holds boxes by their corners; an MJCF, URDF or SDF holds fixed shapes, of which
+boxes are taken, and meshes with the corners of a box.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from clamber.errors import InputError, check_kind, unreadable
+from clamber.model.description import (
+    compile_description,
+    read_description,
+    read_mesh,
+    read_xml,
+)
+from clamber.model.scene import GROUND, Box
+from clamber.model.se3 import matrix_from_rpy
+
+NAME = r"^[A-Za-z][A-Za-z0-9_]*$"  # of a box
+DEFAULT_FRICTION = 0.8
+_LARGEST = 1e6  # [m]
+_FIT = 2e-3  # [m] a vertex further than this from the fitted box is no box's
+_SAME = 1e-5  # of the size of all: nearer vertices are one corner
+_NO_BOX = "no other shapes than boxes are climbed: put boxes in its place"
+
+
+def read_obj(
+    path: Path,
+    scale: float = 1.0,
+    up: str = "z",
+    friction: float = DEFAULT_FRICTION,
+) -> list[Box]:
+    """Boxes of an OBJ in the order of the file.
+
+    An object (`o` or `g`) of one box gives it its name; others are called `box1`,
+    `box2` and so on. A box has eight corners: where vertices share one, as exporters
+    write them, faces tell which belong together; without, eight in a row do.
+
+    Args:
+        path: The file.
+        scale: Metres per unit.
+        up: The axis that points up in it.
+        friction: Of the boxes.
+
+    Raises:
+        InputError: It is no such file.
+    """
+    check_kind(path, "an OBJ")
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as e:
+        raise unreadable(path, e) from e
+    except UnicodeDecodeError as e:
+        raise InputError("an OBJ file, in UTF-8", path) from e
+    name: str | None = None
+    vertices: list[list[float]] = []
+    names: list[str | None] = []  # of each vertex: the object it is listed in
+    faces: list[tuple[str | None, list[int]]] = []
+    for number, line in enumerate(lines, start=1):
+        word, *rest = line.split() or [""]
+        if word in ("o", "g") and rest:
+            name = rest[0]
+        elif word == "v":
+            try:
+                x = [float(a) for a in rest[:3]]
+            except ValueError:
+                x = []
+            if len(x) != 3 or not np.all(np.isfinite(x)):
+                raise InputError("three finite numbers", path, f"line {number}")
+            vertices.append(x)
+            names.append(name)
+        elif word == "f":
+            faces.append((name, _indices(rest, len(vertices), number, path)))
+    if not vertices:
+        raise InputError("8 vertices a box", path, "v", 0)
+    v = to_z_up(scale * np.array(vertices), up)
+    pieces = _pieces(v, names, faces)
+    count = {n: sum(m == n for m, _ in pieces) for n, _ in pieces}
+    boxes: list[Box] = []
+    for name, rows in pieces:
+        single = name if name is not None and count[name] == 1 else None
+        called = single or f"box{len(boxes) + 1}"
+        box = replace(_fit_box(called, _corners(v[rows]), path), friction=friction)
+        boxes.append(box)
+    return boxes
+
+
+def _indices(words: list[str], count: int, line: int, path: Path) -> list[int]:
+    """Of the vertices of a face, from 0; those below 0 count from the end."""
+    try:
+        found = [int(w.split("/")[0]) for w in words]
+    except ValueError:
+        found = [0]
+    found = [i - 1 if i > 0 else count + i for i in found if i]
+    if len(found) != len(words) or not all(0 <= i < count for i in found):
+        raise InputError("indices of vertices before it", path, f"line {line}")
+    return found
+
+
+def _pieces(
+    v: np.ndarray,
+    names: Sequence[str | None],
+    faces: Sequence[tuple[str | None, list[int]]],
+) -> list[tuple[str | None, list[int]]]:
+    """Which vertices (N, 3) make a solid each, and the object's name."""
+    by_eight: list[tuple[str | None, list[int]]] = []
+    for name, several in itertools.groupby(range(len(v)), key=lambda i: names[i]):
+        rows = list(several)
+        if len(rows) > 8 and len(_corners(v[rows])) == 8:
+            by_eight.append((name, rows))
+            continue
+        by_eight += [(name, rows[k : k + 8]) for k in range(0, len(rows), 8)]
+    used = [i for _, f in faces for i in f]
+    if len(set(used)) < len(v):  # points alone, or some of them
+        return by_eight
+    called: dict[int, str | None] = {i: n for n, f in faces for i in f}
+    for merged in (False, True):
+        root = _joined(v, [f for _, f in faces], merged)
+        solids: dict[int, list[int]] = {}
+        for i in range(len(v)):
+            solids.setdefault(int(root[i]), []).append(i)
+        if merged or all(len(rows) == 8 for rows in solids.values()):
+            break
+    return [(called[rows[0]], rows) for rows in solids.values()]
+
+
+def _joined(v: np.ndarray, faces: list[list[int]], merged: bool) -> np.ndarray:
+    """(N,) the least vertex to which each is joined by faces.
+
+    Args:
+        v: (N, 3) vertices.
+        faces: Indices.
+        merged: Whether vertices at one place are joined too.
+    """
+    root = np.arange(len(v))
+    links = [(f[0], i) for f in faces for i in f[1:]]
+    if merged:
+        same: dict[tuple, int] = {}
+        for i, place in enumerate(map(tuple, _rounded(v).tolist())):
+            links.append((same.setdefault(place, i), i))
+
+    def find(i: int) -> int:
+        while root[i] != i:
+            root[i] = root[root[i]]
+            i = int(root[i])
+        return i
+
+    for a, b in links:
+        x, y = sorted((find(a), find(b)))
+        root[y] = x
+    return np.array([find(i) for i in range(len(v))])
+
+
+def _rounded(v: np.ndarray) -> np.ndarray:
+    """Vertices (N, 3) as whole numbers of a length that tells corners apart."""
+    size = float(np.ptp(v, axis=0).max())
+    return np.round(v / (_SAME * size if size > 0 else 1.0))
+
+
+def _corners(v: np.ndarray) -> np.ndarray:
+    """(K, 3) vertices (N, 3), each place once; the very same where none is double."""
+    _, first = np.unique(_rounded(v), axis=0, return_index=True)
+    return v if len(first) == len(v) else v[np.sort(first)]
+
+
+# Which axes, with which sign, become x, y and z: always a rotation, never a mirror.
+AXES = {
+    "z": ((0, 1), (1, 1), (2, 1)),
+    "y": ((0, 1), (2, -1), (1, 1)),
+    "x": ((1, 1), (2, 1), (0, 1)),
+    "-z": ((0, 1), (1, -1), (2, -1)),
+    "-y": ((0, 1), (2, 1), (1, -1)),
+    "-x": ((2, 1), (1, 1), (0, -1)),
+}
+
+
+def to_z_up(x: np.ndarray, up: str) -> np.ndarray:
+    """Coordinates (..., 3) in which `up` points up as coordinates with z up."""
+    return np.stack([sign * x[..., k] for k, sign in AXES[up]], axis=-1)
+
+
+def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
+    """The box (8, 3) vertices belong to, in any order: upright if it can be."""
+    if len(v) != 8:
+        found = f"{len(v)} corners"
+        raise InputError(f"8 vertices of a box: {_NO_BOX}", path, name, found)
+    order = np.argsort(v[:, 2], kind="stable")
+    base = v[order[:4]]
+    # Of the three ways from one corner to the others the longest is the diagonal.
+    ways = sorted((base[1:] - base[0])[:, :2], key=np.linalg.norm)
+    yaw = float(np.arctan2(ways[1][1], ways[1][0]))
+    yaw = (yaw + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    R = matrix_from_rpy([0.0, 0.0, yaw])
+    off, low, high = _extent(v, R)
+    if off > _FIT:
+        tilted = _tilted(v)
+        if tilted is not None:
+            R = tilted
+            off, low, high = _extent(v, R)
+    if off > _FIT or np.any(high - low < _FIT):
+        raise InputError(
+            "8 vertices of a box "
+            f"(one is {off:.3f} m off; size {(high - low).round(3).tolist()})",
+            path,
+            name,
+        )
+    return Box(name=name, size=high - low, position=R @ (low + high) / 2, rotation=R)
+
+
+def _extent(v: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """How far vertices are from a box along the axes `R`, its low and high corner."""
+    local = v @ R
+    low, high = local.min(axis=0), local.max(axis=0)
+    off = np.minimum(np.abs(local - low), np.abs(local - high)).max()
+    return float(off), low, high
+
+
+def _tilted(v: np.ndarray) -> np.ndarray | None:
+    """(3, 3) axes of a box that leans, the most upright last; None: no right angles.
+
+    Three ways from one corner are its edges where they are square to each other; of
+    those that are, the shortest: the others are diagonals of faces.
+    """
+    if np.abs(v).max() > _LARGEST:
+        return None
+    ways = v[1:] - v[0]
+    best, axes = np.inf, None
+    for triple in itertools.combinations(ways, 3):
+        lengths = np.array([np.linalg.norm(x) for x in triple])
+        if lengths.min() < _FIT:
+            continue
+        units = np.array(triple) / lengths[:, None]
+        square = float(np.abs(units @ units.T - np.eye(3)).max())
+        off, _, _ = _extent(v, units.T)
+        if square < 0.02 and off <= _FIT and lengths.sum() < best:
+            best, axes = float(lengths.sum()), units
+    if axes is None:
+        return None
+    z = axes[int(np.argmax(np.abs(axes[:, 2])))]
+    z = z * np.sign(z[2])
+    rest = [a for a in axes if abs(a @ z) < 0.5]
+    x = max(rest, key=lambda a: abs(a[0]))
+    x = x * (np.sign(x[0]) or 1.0)
+    x = x - z * (x @ z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def read_described(
+    path: Path, friction: float = DEFAULT_FRICTION
+) -> tuple[list[Box], float | None]:
+    """Boxes of an MJCF or URDF that are fixed to the world, and its plane's friction.
+
+    Args:
+        path: The file.
+        friction: Of the boxes of a URDF, which says none.
+
+    Raises:
+        InputError: It is no such file, or holds other fixed shapes than boxes, meshes
+            of boxes and a plane.
+    """
+    says_friction = read_xml(path).tag != "robot"
+    model = compile_description(read_description(path, lenient=True), path)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    boxes: list[Box] = []
+    ground = None
+    for g in range(model.ngeom):
+        body = int(model.geom_bodyid[g])
+        solid = model.geom_contype[g] or model.geom_conaffinity[g]
+        if model.body_weldid[body] != 0 or not solid:
+            continue
+        mu = float(model.geom_friction[g, 0]) if says_friction else friction
+        place, R = data.geom_xpos[g].copy(), data.geom_xmat[g].reshape(3, 3).copy()
+        kind, name = mujoco.mjtGeom(int(model.geom_type[g])), model.geom(g).name
+        if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+            ground = mu
+            continue
+        called = _called(name, model.body(body).name if body else "", boxes)
+        where = f"geom {name!r}" if name else _place(model.body(body).name, place)
+        if kind == mujoco.mjtGeom.mjGEOM_BOX:
+            size = 2.0 * model.geom_size[g]
+            box = Box(name=called, size=size, position=place, rotation=R)
+        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[g])
+            first = int(model.mesh_vertadr[mesh])
+            v = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+            v = place + v.astype(float) @ R.T
+            box = _box_of_mesh(
+                called, v, f"{where}: mesh {model.mesh(mesh).name!r}", path
+            )
+        else:
+            what = kind.name.removeprefix("mjGEOM_").lower()
+            raise InputError(f"boxes and a plane: {_NO_BOX}", path, where, what)
+        boxes.append(replace(box, friction=mu))
+    if not boxes:
+        raise InputError("a box that is fixed to the world", path, "geom")
+    return boxes, ground
+
+
+def _called(name: str, place: str, boxes: Sequence[Box]) -> str:
+    """A box's name: its own, or that of the body it is on, or its number."""
+    taken = {b.name for b in boxes} | {GROUND}
+    for wanted in (name, place, *(f"{place}{k}" for k in range(2, len(boxes) + 2))):
+        plain = re.sub(r"[^A-Za-z0-9_]", "_", wanted)
+        if re.match(NAME, plain) and plain not in taken:
+            return plain
+    return f"box{len(boxes) + 1}"
+
+
+def _place(body: str, position: np.ndarray) -> str:
+    """What a shape without a name is called in messages."""
+    at = ", ".join(f"{x:.3g}" for x in position)
+    return f"the geom at ({at})" + (f" of {body!r}" if body else "")
+
+
+def _box_of_mesh(name: str, v: np.ndarray, where: str, path: Path) -> Box:
+    """The box whose corners the vertices of a mesh are, in the world."""
+    corners = _corners(v)
+    if len(corners) == 8:
+        try:
+            return _fit_box(name, corners, path)
+        except InputError:
+            pass
+    expected = f"the corners of a box: {_NO_BOX}"
+    raise InputError(expected, path, where, f"{len(corners)} corners")
+
+
+# SDF, Gazebo's description of worlds and models.
+
+
+def read_sdf(path: Path, friction: float = DEFAULT_FRICTION) -> list[Box]:
+    """Boxes of the static models of an SDF; of all models where none is static.
+
+    Raises:
+        InputError: It is no such file, or holds what is no box.
+    """
+    root = read_xml(path)
+    models = list(root.iter("model"))
+    if root.tag != "sdf" or not models:
+        raise InputError("an SDF with a model", path, "<model>")
+    include = root.find(".//include")
+    if include is not None:
+        uri = include.findtext("uri", "")
+        expected = "models written out in this file, not included from others"
+        raise InputError(expected, path, "<include>", uri)
+    static = [m for m in models if _is_true(m.findtext("static", ""))]
+    boxes: list[Box] = []
+    for model in static or models:
+        for link in model.findall("link"):
+            for shape in link.findall("collision"):
+                label = model.get("name", ""), link.get("name", "")
+                where = f"collision {shape.get('name')!r} of {'/'.join(label)}"
+                R, p = np.eye(3), np.zeros(3)
+                for element in (model, link, shape):
+                    R_next, p_next = _pose(element, where, path)
+                    R, p = R @ R_next, p + R @ p_next
+                name = _called("", label[0] if len(model) else "", boxes)
+                box = _sdf_box(shape, name, R, p, where, path)
+                if box is not None:
+                    mu = shape.findtext("surface/friction/ode/mu")
+                    mu = friction if mu is None else min(_number(mu, where, path), 1.0)
+                    boxes.append(replace(box, friction=mu))
+    if not boxes:
+        raise InputError("a collision shape that is a box", path, "<collision>")
+    return boxes
+
+
+def _sdf_box(
+    shape: ElementTree.Element,
+    name: str,
+    R: np.ndarray,
+    p: np.ndarray,
+    where: str,
+    path: Path,
+) -> Box | None:
+    """Of a collision at a pose; None of a plane."""
+    geometry = shape.find("geometry")
+    kinds = [] if geometry is None else list(geometry)
+    kind = kinds[0] if kinds else ElementTree.Element("nothing")
+    if kind.tag == "plane":
+        return None
+    if kind.tag == "box":
+        size = _numbers(kind.findtext("size", ""), 3, where, path)
+        if np.any(size <= 0):
+            raise InputError("positive lengths", path, where, size.tolist())
+        return Box(name=name, size=size, position=p, rotation=R)
+    if kind.tag == "mesh":
+        uri = kind.findtext("uri", "")
+        scale = _numbers(kind.findtext("scale", "1 1 1"), 3, where, path)
+        file = path.parent / re.sub(r"^(file|model|package)://", "", uri)
+        v = read_mesh(file).vertices * scale
+        return _box_of_mesh(name, p + v @ R.T, f"{where}: mesh {uri!r}", path)
+    raise InputError(f"boxes and a plane: {_NO_BOX}", path, where, kind.tag)
+
+
+def _pose(
+    element: ElementTree.Element, where: str, path: Path
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and place (3,) of an element in the one around it."""
+    pose = element.find("pose")
+    if pose is None or not (pose.text or "").strip():
+        return np.eye(3), np.zeros(3)
+    if pose.get("relative_to"):
+        expected = "poses relative to what is around them, as without relative_to"
+        raise InputError(expected, path, where, pose.get("relative_to"))
+    x = _numbers(pose.text or "", 6, where, path)
+    angles = np.radians(x[3:]) if _is_true(pose.get("degrees", "")) else x[3:]
+    return matrix_from_rpy(angles.tolist()), x[:3]
+
+
+def _is_true(text: str | None) -> bool:
+    return (text or "").strip().lower() in ("1", "true")
+
+
+def _number(text: str, where: str, path: Path) -> float:
+    return float(_numbers(text, 1, where, path)[0])
+
+
+def _numbers(text: str, count: int, where: str, path: Path) -> np.ndarray:
+    """So many finite numbers of a text."""
+    try:
+        x = np.array([float(w) for w in text.split()])
+    except ValueError:
+        x = np.array([np.nan])
+    if len(x) != count or not np.isfinite(x).all() or np.abs(x).max() > _LARGEST:
+        raise InputError(f"{count} finite numbers", path, where, text.strip()[:40])
+    return x
