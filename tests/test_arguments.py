@@ -23,6 +23,7 @@ RECORDS = {n: c for n, c in PUBLIC.items() if dataclasses.is_dataclass(c)}
 def test_every_public_function_names_an_argument_of_another_kind(name: str):
     parameters = inspect.signature(FUNCTIONS[name]).parameters.values()
     needed = [p.name for p in parameters if p.default is p.empty]
+    needed = needed or [next(iter(parameters)).name]
     with pytest.raises(WrongType) as caught:
         FUNCTIONS[name](**{n: object() for n in needed})
     assert caught.value.field == needed[0]

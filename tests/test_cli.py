@@ -548,7 +548,7 @@ def test_render_passes_on_what_is_asked(here: Path, monkeypatch: Patch):
 
     note("pictures", "render_frame")
     note("pictures", "keyframe_sheet")
-    note("renderer", "video")
+    note("film", "video")
     frame = ["--frame", "9.5", "--transparent", "--camera", "top", "--size", "720p"]
     assert cli.main(["render", "run", *frame, "--quiet"]) == 0
     wanted = {"out": None, "transparent": True, "camera": "top", "size": (1280, 720)}
@@ -556,7 +556,7 @@ def test_render_passes_on_what_is_asked(here: Path, monkeypatch: Patch):
     assert cli.main(["render", "run", "--sheet", "--size", "300x200", "--quiet"]) == 0
     name, args, options = asked.pop()
     assert (name, args[1]) == ("keyframe_sheet", Path("run/keyframes.png"))
-    assert options == {"camera": "corner", "tile": (300, 200)}
+    assert (options["camera"], options["tile"]) == ("corner", (300, 200))
     assert cli.main(["render", "run", "--video", "--out", "a.webp", "--quiet"]) == 0
     name, args, options = asked.pop()
     assert (name, args[2]) == ("video", Path("run"))

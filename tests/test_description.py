@@ -73,7 +73,7 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
         ("package://pack/gone.stl", None, "not there"),
         ("file:///nowhere/gone.stl", None, "not there"),
         ("gone.stl", LFS, "Git LFS pointer"),
-        ("gone.stl", b"<!DOCTYPE html><html>", "HTML page"),
+        ("gone.stl", b"<!DOCTYPE html><html>", "web page"),
         ("gone.stl", b"PK\x03\x04....", "zip archive"),
         ("gone.stl", b"", "empty"),
     ],
@@ -187,7 +187,7 @@ def test_what_is_no_description_is_refused_in_one_sentence(tmp_path, content, wo
 def test_a_file_that_stands_in_anothers_place_is_told(tmp_path):
     for content, word in (
         (LFS, "Git LFS"),
-        (b"<!DOCTYPE html>", "HTML"),
+        (b"<!DOCTYPE html>", "web page"),
         (b"PK\3\4", "zip"),
     ):
         (tmp_path / "robot.urdf").write_bytes(content)

@@ -133,9 +133,7 @@ def flags_of(command: str) -> frozenset[str]:
     return frozenset(re.findall(r"--[a-z][\w.-]*", out.getvalue()))
 
 
-COMMANDS = frozenset(
-    re.findall(r'subcommand\("(\w+)"\)', Path(cli.commands.__file__).read_text())
-)
+COMMANDS = frozenset(cli.COMMANDS)
 
 
 def check_command(words: Sequence[str]) -> None:

@@ -488,12 +488,12 @@ def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path, to):
 @pytest.mark.parametrize(
     ("options", "source", "value"),
     [
-        ({"to": "bvh"}, "--to", "bvh"),
+        ({"to": "bvh"}, "export_run()", "bvh"),
         ({"to": "csv", "rate": 0}, "--rate", 0),
         ({"to": "csv", "rate": 300}, "--rate", 300),
         ({"to": "csv", "rate": 2000}, "--rate", 2000),
         ({"to": "csv", "layout": "mjlab"}, "--layout", "mjlab"),
-        ({"to": "npz", "layout": "gmr"}, "--layout", "gmr"),
+        ({"to": "npz", "layout": "gmr"}, "export_run()", "gmr"),
         ({"to": "csv", "lead_in": "nowhere.yaml"}, Path("nowhere.yaml"), None),
         ({"to": "csv", "out": "no/folder/a.csv"}, "--out", "no/folder/a.csv"),
     ],

@@ -328,7 +328,8 @@ def test_where_nothing_is_found_it_says_what_was_tried(
 def test_where_the_time_is_over_nothing_else_is_tried(demo_sequence, coman):
     found = plan(demo_sequence, coman, LOW, budget=Budget(seconds=0.0))
     assert [f.status for f in found.failures] == [Status.BUDGET]
-    assert found.fallback is None
+    assert "0 s allowed are spent" in found.fallback.reason
+    assert not any(t.steps for t in found.fallback.tried)
 
 
 def test_contacts_without_alternatives_are_tried_once(failing, demo_sequence, coman):

@@ -16,6 +16,7 @@ import clamber
 from clamber.cli.output import (
     Output,
     Report,
+    Switch,
 )
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
@@ -90,9 +91,9 @@ RunFolder = Annotated[Path, tyro.conf.Positional, shown("RUN")]
 class RecordingFlags:
     """What a recording does not say of itself."""
 
-    fit_floor: bool = False
+    fit_floor: Switch = False
     """Correct the heights of floor and boxes by whatever rests on them."""
-    subject: str | None = None
+    subject: Annotated[str | None, shown("NAME")] = None
     """Which person, where several were recorded."""
     body_model: Annotated[Path | None, shown("FILE")] = None
     """SMPL's body model (.npz, .pkl), for poses without joints."""
