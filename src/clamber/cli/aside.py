@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import clamber
@@ -18,10 +21,8 @@ Drawing = Callable[..., Future[None]]
 @contextlib.contextmanager
 def drawing_aside() -> Iterator[Drawing]:
     """What draws aside; the process begins to import at once, and is waited for."""
-    # As sweeps do; it does not run the caller's script a second time, as spawn does.
-    from joblib.externals.loky import ProcessPoolExecutor
-
-    pool = ProcessPoolExecutor(1)
+    ForkingPickler.register(MappingProxyType, _of_mapping)
+    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
     try:
         pool.submit(_prepare)
 
@@ -36,8 +37,18 @@ def drawing_aside() -> Iterator[Drawing]:
         yield draw
         pool.shutdown(wait=True)
     except BaseException:
-        pool.shutdown(wait=True, kill_workers=True)
+        for child in multiprocessing.active_children():
+            child.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
         raise
+
+
+def _of_mapping(mapping: MappingProxyType) -> tuple[Callable, tuple[dict]]:
+    return _mapping, (dict(mapping),)
+
+
+def _mapping(content: dict) -> MappingProxyType:
+    return MappingProxyType(content)
 
 
 def _prepare() -> None:
