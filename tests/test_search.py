@@ -12,7 +12,7 @@ from clamber.contact.scaling import retarget
 from clamber.contact.steps import MOVED, Seeds, Step, split_steps
 from clamber.errors import Status
 from clamber.model.scene import Box, Scene
-from clamber.model.se3 import matrix_from_rpy
+from clamber.model.se3 import matrix_from_quat, matrix_from_rpy
 from clamber.model.world import build_world
 from clamber.planning import demonstrated, search
 from clamber.planning.demonstrated import VARIATIONS, follow_steps, repairs
@@ -72,6 +72,25 @@ def moved(step: Step, *, support: str | None = None, position, fixed=False) -> S
     makes = step.makes
     makes = replace(makes, support=support or makes.support, position=position)
     return replace(step, makes=makes, fixed=fixed)
+
+
+def test_where_nothing_else_works_a_foot_that_may_turns(ik, monkeypatch):
+    """The contact asked for is backwards; every other way to it is closed."""
+    start = standing(ik, OPTIONS)
+    foot = next(c for c in start.stance if c.surface == "LFoot")
+    back = replace(foot, quaternion=np.array([0.0, 0.0, 0.0, 1.0]))
+    step = Step(limb="left_leg", breaks=("LFoot",), makes=back)
+    monkeypatch.setattr(change_module, "_keyframes", lambda *_: iter(()))
+    assert isinstance(change_contact(ik, start, step, OPTIONS), Failure)
+    found = change_contact(ik, start, replace(step, turns=True), OPTIONS)
+    assert isinstance(found, Change)
+    made = next(c for c in found.keyframe.stance if c.surface == "LFoot")
+    ik.kin.update(found.keyframe.q)
+    surface = ik.world.surfaces["LFoot"]
+    R_WC = ik.kin.rotation(surface.body) @ surface.rotation
+    np.testing.assert_allclose(matrix_from_quat(made.quaternion), R_WC, atol=1e-3)
+    np.testing.assert_allclose(R_WC[:, 2], [0.0, 0.0, 1.0], atol=1e-3)  # it is flat
+    assert made.position[2] == 0.0
 
 
 # Standing.
