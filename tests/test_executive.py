@@ -46,8 +46,10 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_from_yaw, quat_multiply
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.planner import timed
+from clamber.planning.records import numbered
 from clamber.planning.trajectory import HOLD_END, HOLD_START
 from clamber.step.change import Failure
+from test_gait import POLICY
 
 EXACT = {"noise": 0.0, "delay": 0.0}
 TOP = 0.275  # [m] the box that was planned for
@@ -506,6 +508,40 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
         told.finish()
         assert kinds(told.events[1:]) == said
         assert told.executive.stopped == "no way"
+
+
+@pytest.mark.parametrize(
+    ("again", "when"),
+    [
+        pytest.param([1], [0, 1, 2], id="the rest"),
+        pytest.param([0, 1], [0, 2, 3], id="one step again"),
+        pytest.param([0], [0, 2, 2], id="one step less"),
+    ],
+)
+def test_a_policy_followed_anew_reaches_the_keyframes_of_the_plan(
+    hands_plan, monkeypatch, again, when
+):
+    """Its steps begin at 0 again; `when`: after so many changes each was reached."""
+    made = replace(hands_plan, policy=POLICY)
+    changes = numbered([hands_plan.changes[i] for i in again])
+    t = timed(made.world, changes, "max")
+    found = replace(made, start=made.keyframes[1], changes=changes, trajectory=t)
+    monkeypatch.setattr(executive, "plan", lambda *_, **__: found)
+    told, touch = Told(made), touch_of(made, 0)
+    told.to(touch - 100)
+    told.up = 1.1 * FALLBACK
+    told.to(touch, LHand=50.0)
+    told.until(2)
+    assert kinds(told.events) == [ContactMoved, Replanned]
+    replanned = told.executive.core.steps - 1
+    told.trajectory, told.k, told.moves, told.up = t, 299, True, 0.0
+    told.finish()
+    assert told.executive.stopped == ""
+    before = replanned - round((LOOK + THINKING) / PHYSICS_STEP)
+    ends = replanned + np.array([end_of(found, i) for i in range(len(again))]) - 299
+    steps = np.array([0, before, *ends])
+    reached = told.executive.followed.keyframes / PHYSICS_STEP
+    assert reached == pytest.approx(steps[when], abs=2.0)
 
 
 @pytest.mark.parametrize("found", [True, False])

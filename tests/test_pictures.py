@@ -23,7 +23,7 @@ from clamber.model.world import World, build_world
 from clamber.planning.records import Plan
 from clamber.run import folder as run_files
 from clamber.show import film, marks, pictures, renderer
-from clamber.show.sample import force_by_contact
+from clamber.show.sample import force_by_contact, planned_forces
 from clamber.show.skeleton import skeleton_of
 
 SIZE = (160, 120)
@@ -347,6 +347,30 @@ def test_a_frame_of_a_plan_needs_no_physics(plan: Plan, tmp_path: Path, opengl: 
     path = pictures.render_frame(tmp_path, 0.5, size=SIZE)
     assert path == tmp_path / "frame-0.5.png"
     assert pixels(path).std() > 10
+
+
+def test_a_frame_of_a_plan_shows_the_forces_that_hold_it(
+    plan: Plan, tmp_path: Path, opengl: None
+):
+    """Over each contact an arrow; together they are the weight, at any time."""
+    run_files.save_plan(plan, tmp_path)
+    weight = 9.81 * plan.world.mass
+    for row in (0, len(plan.trajectory.time) // 2, -1):
+        closed, forces = planned_forces(plan, plan.trajectory, row)
+        assert np.all(closed == plan.trajectory.contact[row])
+        assert forces.sum(axis=0) == pytest.approx([0, 0, weight], abs=1e-3 * weight)
+        assert np.all(forces[closed, 2] > 0)
+        assert not forces[~closed].any()
+    end = float(plan.trajectory.time[-1])
+    seen = [
+        pixels(
+            pictures.render_frame(
+                tmp_path, end, size=SIZE, marks=marks, out=tmp_path / f"{marks}.png"
+            )
+        )
+        for marks in ("contacts", "forces")
+    ]
+    assert np.any(seen[0] != seen[1], axis=2).sum() > 100
 
 
 def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(

@@ -96,6 +96,13 @@ def test_keyframes_are_reached_when_the_plan_says(plan: Plan, rollout: Rollout):
     assert sample.keyframe_times(bare, None) == [0.0, 1.0]
 
 
+def test_a_change_is_under_way_until_its_keyframe_is_reached():
+    names, reached = ["one", "two"], [0.0, 1.0, 2.0]
+    at = [sample.change_at(names, reached, t) for t in (0.0, 0.9, 1.0, 1.9, 2.0)]
+    assert at == ["one", "one", "two", "two", "done"]
+    assert sample.change_at(names, [0.0, 1.0, None], 9.0) == "two"
+
+
 def test_keyframes_of_an_adapted_run_are_reached_when_it_says(
     plan: Plan, rollout: Rollout
 ):

@@ -45,7 +45,7 @@ from clamber.execution.events import (
     Unintended,
 )
 from clamber.execution.probe import REACH, guarded_move
-from clamber.execution.progress import Progress, Span
+from clamber.execution.progress import Progress, Span, nearest_keyframe
 from clamber.execution.reference import Actions, Reference
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import joint_servo, self_positioning
@@ -238,6 +238,9 @@ class Executive:
                 break
         if self._at_hand.failure and not self.stopped:
             self._stop(self._at_hand.failure)
+        if not self.stopped:  # whatever is left was not needed to get there
+            left = len(self._plan.keyframes) - len(self._reached)
+            self._reached += self._reached[-1:] * left
         yield from self._end()
 
     def _make_change(self, span: Span) -> Actions:
@@ -525,14 +528,19 @@ class Executive:
     def _count_change(self) -> None:
         """The present contact change has been done."""
         at_hand = self._at_hand
-        index = at_hand.plan.changes[at_hand.change].step.index
+        made = at_hand.plan.changes[at_hand.change]
         at_hand.change += 1
-        now, n = (self.core.steps - 1) * PHYSICS_STEP, len(self._reached)
-        if index is not None:
-            self.done = index + 1
+        n: int | None = len(self._reached)
+        if made.step.index is not None:
+            self.done = made.step.index + 1
             n = self.done - self._begun  # one that is made again counts once
-        self._reached += [now] * (n - len(self._reached))
-        self._reached[n:] = [now]
+        if self._plan.policy is not None and at_hand.plan is not self._plan:
+            # Its steps are numbered anew, and there may be more or fewer of them.
+            n = nearest_keyframe(self._plan, made, begin=len(self._reached) - 1)
+        if n is not None:
+            now = (self.core.steps - 1) * PHYSICS_STEP
+            self._reached += [now] * (n - len(self._reached))
+            self._reached[n:] = [now]
 
     def _in_use(self) -> set[str]:
         """Surfaces in contact or about to be, or loaded in place of one that is."""

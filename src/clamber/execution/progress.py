@@ -11,6 +11,8 @@ from clamber.contact.contact import Contact
 from clamber.model.records import short_repr
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
+from clamber.step.change import Change
+from clamber.step.posture import Keyframe
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,6 +77,34 @@ class Progress:
         """Those whose surfaces, of nS in order, are in contact: (nS,) bool."""
         row = surfaces.index
         return [c for s, c in self.near_contacts().items() if closed[row(s)]]
+
+
+def nearest_keyframe(plan: Plan, made: Change, *, begin: int) -> int | None:
+    """Which keyframe of a plan a contact change leads to that is of another plan.
+
+    Args:
+        plan: Its keyframes are looked at, but for the start.
+        made: The change.
+        begin: The first keyframe that it may be.
+
+    Returns:
+        Of those after the same step, with the same surfaces on the same supports, the
+        one whose contacts are the nearest, the first of equals; None: there is none.
+    """
+    here = _places(made.keyframe)
+    away: dict[int, float] = {}
+    for i, change in enumerate(plan.changes, start=1):
+        there = _places(change.keyframe)
+        same = str(change.step) == str(made.step) and there.keys() == here.keys()
+        if i >= begin and same:
+            gaps = [np.linalg.norm(p - here[k]) for k, p in there.items()]
+            away[i] = float(sum(gaps))
+    return min(away, key=away.__getitem__, default=None)
+
+
+def _places(key: Keyframe) -> dict[tuple[str, str], np.ndarray]:
+    """(3,) of each contact, by surface and support."""
+    return {(c.surface, c.support): c.position for c in key.stance}
 
 
 def _spans(plan: Plan, t: Trajectory) -> list[Span]:

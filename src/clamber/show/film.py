@@ -42,7 +42,7 @@ from clamber.show.renderer import (
     seen_points,
     view_of,
 )
-from clamber.show.sample import keyframe_times, thinned
+from clamber.show.sample import change_at, keyframe_times, thinned
 from clamber.show.skeleton import Skeleton, paired_times, recording_named, skeleton_of
 
 Marks = Literal["none", "contacts", "forces"]
@@ -124,8 +124,11 @@ class Person:
 
 
 def skeleton_of_plan(plan: Plan) -> Skeleton | None:
-    """The recording that a plan was made of; None where it is not to be found."""
-    name = recording_named(plan.sequence.source)
+    """The recording that a plan was made of; None where it is not to be found.
+
+    None, too, of a plan that follows a policy: nobody made those contacts.
+    """
+    name = None if plan.iterations else recording_named(plan.sequence.source)
     if name is None:
         return None
     try:
@@ -222,13 +225,13 @@ def _frames(
     rows = np.searchsorted(rollout.time, times)
     loaded, forces = loads_of(rollout, rows)
     moves = [str(c.step) for c in plan.changes]
-    starts = plan.trajectory.keyframes if plan.trajectory is not None else np.zeros(1)
+    reached = keyframe_times(plan, rollout)
     kin = Kinematics(world)
     seen = seen_points(kin, rollout.qpos)
     person, paired = None, None
     if skeleton is not None:
         person = Person(skeleton, world, seen, camera)
-        paired = paired_times(plan, keyframe_times(plan, rollout), duration)
+        paired = paired_times(plan, reached, duration)
     beside = None if person is None else person.points
     view = view_of(world, seen, size[0] / size[1], camera, beside)
     letters = max(14, round(size[1] / 32))
@@ -249,9 +252,7 @@ def _frames(
                 kin.update(rollout.qpos[row])
                 with_forces = forces[i] if marks == "forces" else None
                 draw_marks(picture, view, contact_marks(kin, loaded[i], with_forces))
-            # On its way to where the first move begins, it is that one's.
-            move = max(int(np.searchsorted(starts, t, side="right")), 1)
-            text = moves[move - 1] if move <= len(moves) else "done"
+            text = change_at(moves, reached, t)
             clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
             below = size[1] - letters // 2
             words = [(letters, below, clock, "ls")]

@@ -45,7 +45,7 @@ LAYERS = {  # name in the page: shown at first
     "contacts": True,
     "forces": True,
     "balance": True,
-    "way of the limb": True,
+    "swing path": True,
     BEFORE_EDITING: False,
     PERSON_LAYER: False,
 }

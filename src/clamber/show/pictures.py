@@ -31,7 +31,7 @@ from clamber.run.folder import (
     load_rollout,
     trajectory_of,
 )
-from clamber.show.film import Marks, video
+from clamber.show.film import Marks, skeleton_of_plan, video
 from clamber.show.marks import (
     DARK,
     LINE,
@@ -61,7 +61,7 @@ from clamber.show.renderer import (
     seen_points,
     view_of,
 )
-from clamber.show.sample import row_at, sample_motion
+from clamber.show.sample import planned_forces, row_at, sample_motion
 from clamber.show.skeleton import skeleton_of
 from clamber.step.posture import Keyframe
 
@@ -289,7 +289,8 @@ def render_run(
     Args:
         folder: With a plan; with a rollout there is more to see.
         with_video: Also the video, which takes the longest.
-        demonstration: The recording and what was found in it.
+        demonstration: The recording and what was found in it; by default, in a video,
+            what the plan names, where it is at hand.
         parts: What is drawn: the recording and the plan, plots of what physics did,
             the sheet of it.
         report: Told of stage, share done and a note.
@@ -338,10 +339,9 @@ def render_run(
     tell("pictures", 1.0, "")
     if rollout is not None:
         if with_video:
-            skeleton = None
-            if demonstration is not None:
-                skeleton = skeleton_of(*demonstration)
-            files.append(video(plan, rollout, folder, skeleton=skeleton, report=tell))
+            known = demonstration is not None
+            person = skeleton_of(*demonstration) if known else skeleton_of_plan(plan)
+            files.append(video(plan, rollout, folder, skeleton=person, report=tell))
     if broken is not None:
         raise broken
     return files
@@ -387,23 +387,30 @@ def render_frame(
         size: Width and height in pixels.
         camera: From where.
         transparent: Robot and obstacles alone, on nothing.
-        marks: Whether contacts, or contacts with their forces, are drawn over it; a
-            plan has no forces but at its keyframes.
+        marks: Whether contacts, or contacts with their forces, are drawn over it; of a
+            plan, the least forces that hold the robot at rest.
 
     Raises:
         InputError: A file is missing or broken, or there is no such time.
         ClamberError: There is no OpenGL.
     """
     folder = Path(folder)
-    rollout, contact = None, np.zeros((0, 0), dtype=bool)
     if (folder / ROLLOUT).exists():
         rollout = load_rollout(folder, with_events=False)
         world, t, q = rollout.world, rollout.time, rollout.qpos
+
+        def loads(row: int) -> tuple[np.ndarray, np.ndarray]:
+            (loaded,), (forces,) = loads_of(rollout, np.array([row]))
+            return loaded, forces
+
     else:
         plan = load_plan(folder)
         trajectory = trajectory_of(plan, folder)
         world, t, q = plan.world, trajectory.time, trajectory.q
-        contact = trajectory.contact
+
+        def loads(row: int) -> tuple[np.ndarray, np.ndarray]:
+            return planned_forces(plan, trajectory, row)
+
     if not t[0] <= time <= t[-1]:
         raise InputError(
             f"a time from {t[0]:g} to {t[-1]:.2f} s", source="--frame", value=time
@@ -418,11 +425,7 @@ def render_frame(
         draw = drawing.cutout if transparent else drawing.shot
         picture = draw(q[row], view)
     if marks != "none" and not transparent:
-        forces = None
-        if rollout is not None:
-            (loaded,), (forces,) = loads_of(rollout, np.array([row]))
-        else:
-            loaded = contact[row]
+        loaded, forces = loads(row)
         kin.update(q[row])
         forces = forces if marks == "forces" else None
         draw_marks(picture, view, contact_marks(kin, loaded, forces))

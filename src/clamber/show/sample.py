@@ -9,7 +9,7 @@ Shapes: n samples, nq coordinates, nS surfaces, na joints, M recorded states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,8 +43,13 @@ from clamber.run.folder import (
 )
 from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import Keyframe
-from clamber.step.stability import contact_points
-from clamber.step.statics import Phase, projected_distance, theta_max
+from clamber.step.stability import contact_points, statics_at
+from clamber.step.statics import (
+    Phase,
+    contact_forces,
+    projected_distance,
+    theta_max,
+)
 
 SAMPLES_A_SECOND = 25
 SHORTEST_LOAD = 0.06  # [s] a shorter touch, or gap, is none
@@ -211,6 +216,18 @@ def keyframe_times(plan: Plan, rollout: Rollout | None) -> list[float | None]:
     return [t if t <= end else None for t in known]
 
 
+def change_at(changes: Sequence[str], reached: Sequence[float | None], t: float) -> str:
+    """The contact change that is under way at a time [s]; after the last `done`.
+
+    Args:
+        changes: What they are called.
+        reached: As `keyframe_times` has it, one more than changes.
+        t: [s].
+    """
+    pairs = zip(changes, reached[1:], strict=True)
+    return next((c for c, at in pairs if at is None or at > t), "done")
+
+
 def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
     """(3,) [N] of each surface, over all its bearing points; zeros where unknown."""
     kin = Kinematics(world)
@@ -220,6 +237,26 @@ def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
     if len(names) != len(forces):
         return {c.surface: np.zeros(3) for c in key.stance}
     return {c.surface: forces[names == c.surface].sum(axis=0) for c in key.stance}
+
+
+def planned_forces(
+    plan: Plan, t: Trajectory, row: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(nS,) bool, contacts closed in a sample of the plan, and (nS, 3) forces [N].
+
+    Those are the least that hold the robot at rest there, zeros of open contacts.
+    """
+    world, closed, q = plan.world, t.contact[row], t.q[row]
+    k = int(np.searchsorted(t.keyframes, t.time[row], side="right"))
+    near = {
+        c.surface: c for x in plan.keyframes[max(k - 1, 0) : k + 1] for c in x.stance
+    }
+    bears = [near[s] for s, on in zip(t.surfaces, closed, strict=True) if on]
+    points, load, torque = statics_at(Kinematics(world), q, bears)
+    forces, surfaces = np.zeros((len(closed), 3)), list(t.surfaces)
+    held = contact_forces(points, load, torque=torque).forces
+    np.add.at(forces, [surfaces.index(n) for n in points.names], held)
+    return closed, forces
 
 
 # The motion, sampled.

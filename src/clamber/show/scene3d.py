@@ -24,6 +24,7 @@ from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.page import paragraphs
 from clamber.show.renderer import seen_points
 from clamber.show.sample import (
+    change_at,
     force_by_contact,
     keyframe_times,
     posture_at,
@@ -222,11 +223,6 @@ class Stage:
         keys = self.motion.time.tolist() if self.motion.stills else []
         return sorted({0.0, *self.motion.events, *keys, self.duration})
 
-    def change_at(self, t: float) -> str:
-        """The contact change that is under way at a time [s]."""
-        pairs = zip(self.changes, self.reached[1:], strict=True)
-        return next((c for c, at in pairs if at is None or at > t), "done")
-
     def show(self, t: float, layers: Mapping[str, bool]) -> str:
         """Send what differs from the last time; figures of this one, as HTML."""
         m, row = self.motion, row_at(self.motion.time, t)
@@ -252,10 +248,11 @@ class Stage:
         self._show_arrows(row, t, layers["forces"])
         self._show_balance(row, layers["balance"])
         way = next((w for end, w in self._swings if end > t), ())
-        self._way.visible = layers["way of the limb"] and len(way) > 1
+        self._way.visible = layers["swing path"] and len(way) > 1
         if self._way.visible:
             self._way.points = np.stack([way[:-1], way[1:]], axis=1)
-        facts = [f"{t:.2f} of {self.duration:.1f} s; {self.change_at(t)}"]
+        under_way = change_at(self.changes, self.reached, t)
+        facts = [f"{t:.2f} of {self.duration:.1f} s; {under_way}"]
         if math.isfinite(m.margin[row]):
             facts.append(f"centre of mass {1000 * m.margin[row]:.0f} mm inside")
         return paragraphs(facts)
