@@ -262,8 +262,9 @@ class _RunPage:
             self._first.root.visible = self._stage is self._first
             if before is not self._first:
                 before.root.remove()
-            self._span()
+            # First: what is sent to a plot just before it goes, the browser misses.
             self._chart.renew()
+            self._span()
 
     def _span(self) -> None:
         """As long as the longest of what is shown; the contacts of the first."""
