@@ -21,10 +21,12 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Box, Scene
 from clamber.model.world import World, build_world
 from clamber.planning.records import Plan
+from clamber.recording.built_in import source_of
 from clamber.run import folder as run_files
 from clamber.show import film, marks, pictures, renderer
 from clamber.show.sample import force_by_contact, planned_forces
 from clamber.show.skeleton import skeleton_of
+from test_gait import POLICY
 
 SIZE = (160, 120)
 
@@ -538,6 +540,17 @@ def test_the_person_is_beside_the_robot_in_a_video_and_called_synthetic(
     points = in_view(rollout.world, rollout.qpos)
     who = film.Person(skeleton, rollout.world, points, "corner")
     assert who.name == "person (synthetic)"
+
+
+def test_the_person_is_whom_the_plan_names_and_nobody_where_a_policy_is_followed(
+    plan: Plan,
+):
+    shown = replace(plan, sequence=replace(plan.sequence, source=source_of("climb")))
+    person = film.skeleton_of_plan(shown)
+    assert person is not None
+    assert person.demo.synthetic
+    assert film.skeleton_of_plan(plan) is None  # of nothing that is at hand
+    assert film.skeleton_of_plan(replace(shown, policy=POLICY)) is None
 
 
 def _silent(stage: str, share: float, note: str) -> None:

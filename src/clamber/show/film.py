@@ -128,7 +128,7 @@ def skeleton_of_plan(plan: Plan) -> Skeleton | None:
 
     None, too, of a plan that follows a policy: nobody made those contacts.
     """
-    name = None if plan.iterations else recording_named(plan.sequence.source)
+    name = None if plan.policy else recording_named(plan.sequence.source)
     if name is None:
         return None
     try:
