@@ -360,10 +360,10 @@ def with_room(
     """Shapes with `ROOM` around them in the nominal posture.
 
     Links that pass each other by less are built to; whoever plans keeps that room. What
-    is no surface gives way, by `THINNER` of its size at most. Links that overlap are
-    not kept apart, and those two joints apart, as in a hip, where they are nearer than
-    `TOUCHING`: they are built around each other, and the shapes stand for more than is
-    there.
+    is no surface gives way, by `THINNER` of its size at most. Links that overlap by
+    more than that makes up for are not kept apart, and those two joints apart, as in a
+    hip, where they are nearer than `TOUCHING`: they are built around each other, and
+    the shapes stand for more than is there.
 
     Returns:
         The shapes, names of links that are not kept apart, and of shapes made thinner.
@@ -375,6 +375,9 @@ def with_room(
         data.qpos[trial.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(trial, data)
     parent, near = trial.body_parentid, []
+    most = {
+        s.name: 0.0 if s.surface else THINNER * min(s.size[: _sizes(s)]) for s in shapes
+    }
     for a in range(trial.ngeom):
         for b in range(a + 1, trial.ngeom):
             i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
@@ -383,22 +386,27 @@ def with_room(
                 two = parent[parent[j]] == i or parent[i] == parent[j]
                 links = trial.body(i).name, trial.body(j).name
                 names = trial.geom(a).name, trial.geom(b).name
-                near.append((d, TOUCHING if two else 0.0, links, names))
+                won = sum(most[n] for n in names)
+                limit = TOUCHING if two else min(0.0, ROOM - won)
+                near.append((d, limit, links, names))
     apart = {links: None for d, limit, links, _ in near if d <= limit}
-    fixed = {s.name for s in shapes if s.surface}
     lack: dict[str, float] = {}
     for d, _, links, names in near:
-        gives = [n for n in names if n not in fixed]
+        gives = [n for n in names if most[n]]
         if links not in apart and d < ROOM:
             for n in gives:
                 lack[n] = max(lack.get(n, 0.0), (ROOM - d) / len(gives))
     out = []
     for s in shapes:
-        n = len(s.size) if s.kind != mujoco.mjtGeom.mjGEOM_CAPSULE else 1
-        less = min(lack.get(s.name, 0.0), THINNER * min(s.size[:n]))
+        less, n = min(lack.get(s.name, 0.0), most[s.name]), _sizes(s)
         size = tuple(x - less if k < n else x for k, x in enumerate(s.size))
         out.append(replace(s, size=size))
     return out, list(apart), sorted(lack)
+
+
+def _sizes(shape: Shape) -> int:
+    """How many of a shape's sizes are thickness: a capsule keeps its length."""
+    return 1 if shape.kind == mujoco.mjtGeom.mjGEOM_CAPSULE else len(shape.size)
 
 
 # The model.
