@@ -304,7 +304,8 @@ def _joint_ball(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) ->
 def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
     """A box whose lower face is the largest rectangle within the sole's outline.
 
-    The sole is level at the zero posture; the rectangle's sides are along and across.
+    The sole is level at the zero posture; the rectangle's sides are along and across,
+    and it reaches under the ankle where the sole does.
     """
     end = int(tree.links[chain.end])
     where = f"body {tree.model.body(end).name!r}"
@@ -314,7 +315,8 @@ def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
         raise InputError(expected, tree.source, where)
     low = float(points[:, 2].min())
     try:
-        (x0, x1), (y0, y1) = _largest_rectangle(sole_points(tree, chain)[:, :2])
+        outline = sole_points(tree, chain)[:, :2]
+        (x0, x1), (y0, y1) = _largest_rectangle(outline, tree.data.xpos[chain.end][0])
     except QhullError as e:
         expected = "a sole with an area, level at the zero posture"
         raise InputError(expected, tree.source, where) from e
@@ -326,9 +328,12 @@ def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
 
 
 def _largest_rectangle(
-    points: np.ndarray, steps: int = 24
+    points: np.ndarray, ankle: float, steps: int = 24
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """X and y range of the largest upright rectangle in the hull of points (K, 2)."""
+    """X and y range of the largest upright rectangle in the hull of points (K, 2).
+
+    Its x range holds the ankle's x, where the hull's does.
+    """
     hull = ConvexHull(points)
     A, b = hull.equations[:, :2], -hull.equations[:, 2]
     xs = np.linspace(points[:, 0].min(), points[:, 0].max(), steps + 1)
@@ -341,8 +346,11 @@ def _largest_rectangle(
         return float(np.max(room[down] / A[down, 1], initial=-np.inf)), high
 
     at = [sides(float(x)) for x in xs]
+    held = bool(xs[0] <= ankle <= xs[-1])
     for i in range(len(xs)):
         for j in range(i + 1, len(xs)):
+            if held and not xs[i] <= ankle <= xs[j]:
+                continue
             # The hull is convex: between two sections it is no narrower than both.
             low, high = max(at[i][0], at[j][0]), min(at[i][1], at[j][1])
             area = float(xs[j] - xs[i]) * (high - low)
