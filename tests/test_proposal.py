@@ -289,6 +289,23 @@ def test_an_elbow_lets_a_forearm_of_its_own_lie_flat(tmp_path):
         assert elbow.bodyid[0] == model.body(f"{s}e").id
 
 
+def test_a_sole_reaches_under_its_ankle(tmp_path):
+    """The largest rectangle of a sole that is wide ahead alone does not."""
+    text, feet = re.subn(
+        r'<geom type="box" size="0.04 [^>]*mass="0.7"/>',
+        '<geom type="box" size="0.005 0.085 0.01" pos="0 0.03 -0.05" mass="0.5"/>'
+        '<geom type="box" size="0.06 0.01 0.01" pos="0 0.105 -0.05" mass="0.2"/>',
+        humanoids.mjcf(),
+    )
+    assert feet == 2
+    proposal = propose_robot(described(tmp_path, "mjcf", text))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    sole = model.geom("LFoot")
+    half, middle = max(sole.size[:2]), max(np.abs(sole.pos[:2]))
+    assert middle + half == pytest.approx(0.115, abs=1e-5)  # the toes
+    assert -0.02 < middle - half < 1e-5  # the ankle is at 0
+
+
 @pytest.mark.parametrize(
     ("radius", "thinner"),
     [(0.018, 0.0), (0.025, 0.0025), (0.031, 0.0055), (0.039, None)],
@@ -310,6 +327,21 @@ def test_links_that_pass_closely_get_the_room_that_planning_keeps(
     assert pelvis == pytest.approx(radius - (thinner or 0.0), abs=1e-5)
     assert thigh == pytest.approx(0.05 - (thinner or 0.0), abs=1e-5)
     assert any("thinner" in n for n in proposal.notes) is bool(thinner)
+
+
+def test_knees_whose_balls_overlap_are_kept_apart_by_smaller_balls(tmp_path):
+    """Knees are 0.16 m apart, balls of 0.077 m hold them and stand out by 6 mm."""
+    shank = 'size="0.042" mass="2.0"/>'
+    knee = '<geom type="sphere" size="0.077" mass="0.01"/>'
+    text = humanoids.mjcf().replace(shank, shank + knee)
+    assert text.count(knee) == 2
+    proposal = propose_robot(described(tmp_path, "mjcf", text))
+    model = mujoco.MjModel.from_xml_string(proposal.mjcf)
+    for name in ("LKnee", "RKnee"):
+        assert model.geom(name).size[0] == pytest.approx(0.075, abs=1e-4)
+    knees = sorted(int(model.geom(n).bodyid[0]) for n in ("LKnee", "RKnee"))
+    assert (knees[0] << 16) + knees[1] not in model.exclude_signature
+    assert any("LKnee" in n and "thinner" in n for n in proposal.notes)
 
 
 @pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 2.0, 3.0)])

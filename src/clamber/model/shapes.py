@@ -368,7 +368,8 @@ def with_room(
     """Shapes with `ROOM` around them in the nominal posture.
 
     Links that pass each other by less are built to; whoever plans keeps that room. What
-    is no surface gives way, by `THINNER` of its size at most. Links that overlap by
+    is no surface gives way, by `THINNER` of its size at most, and where that is too
+    little for links that overlap, so do the balls of surfaces. Links that overlap by
     more than that makes up for are not kept apart, and those two joints apart, as in a
     hip, where they are nearer than `TOUCHING`: they are built around each other, and
     the shapes stand for more than is there.
@@ -383,9 +384,9 @@ def with_room(
         data.qpos[trial.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(trial, data)
     parent, near = trial.body_parentid, []
-    most = {
-        s.name: 0.0 if s.surface else THINNER * min(s.size[: _sizes(s)]) for s in shapes
-    }
+    most = {s.name: THINNER * min(s.size[: _sizes(s)]) for s in shapes}
+    balls = {s.name for s in shapes if s.surface and s.kind == _SPHERE}
+    links_only = {s.name for s in shapes if not s.surface}
     for a in range(trial.ngeom):
         for b in range(a + 1, trial.ngeom):
             i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
@@ -394,13 +395,15 @@ def with_room(
                 two = parent[parent[j]] == i or parent[i] == parent[j]
                 links = trial.body(i).name, trial.body(j).name
                 names = trial.geom(a).name, trial.geom(b).name
-                won = sum(most[n] for n in names)
+                gives = [n for n in names if n in links_only]
+                if d <= min(0.0, ROOM - sum(most[n] for n in gives)):
+                    gives = [n for n in names if n in links_only | balls]
+                won = sum(most[n] for n in gives)
                 limit = TOUCHING if two else min(0.0, ROOM - won)
-                near.append((d, limit, links, names))
+                near.append((d, limit, links, gives))
     apart = {links: None for d, limit, links, _ in near if d <= limit}
     lack: dict[str, float] = {}
-    for d, _, links, names in near:
-        gives = [n for n in names if most[n]]
+    for d, _, links, gives in near:
         if links not in apart and d < ROOM:
             for n in gives:
                 lack[n] = max(lack.get(n, 0.0), (ROOM - d) / len(gives))
