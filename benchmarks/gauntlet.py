@@ -22,6 +22,7 @@ import json
 import os
 import re
 import selectors
+import shutil
 import signal
 import subprocess
 import sys
@@ -304,6 +305,7 @@ def main() -> None:
             continue
         row = Row(file=str(path))
         folder = args.out / re.sub(r"\W+", "_", str(path))[-80:]
+        shutil.rmtree(folder, ignore_errors=True)  # of a run that was broken off
         if path.suffix in RECORDINGS:
             try_recording(path, row, folder, args.limit)
         else:

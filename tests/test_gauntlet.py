@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+import re
 import sys
 import time
 import zipfile
@@ -176,6 +177,9 @@ def test_the_command_itself_is_asked_as_it_wants_to_be(tmp_path, monkeypatch, ga
     monkeypatch.setattr(gauntlet, "COMMAND", (sys.executable, "-m", "clamber"))
     (tmp_path / "h.xml").write_text(humanoids.mjcf())
     (tmp_path / "empty.trc").write_text("")
+    broken_off = tmp_path / "out" / re.sub(r"\W", "_", str(tmp_path / "h.xml"))[-80:]
+    broken_off.mkdir(parents=True)
+    (broken_off / "robot.yaml").write_text("half")
     small = [tmp_path / "h.xml", tmp_path / "empty.trc", "--init-only"]
     found = rows(gauntlet, monkeypatch, *small, tmp_path / "out")
     assert found["h.xml"]["came_out"] == "proposed"

@@ -368,11 +368,11 @@ def with_room(
     """Shapes with `ROOM` around them in the nominal posture.
 
     Links that pass each other by less are built to; whoever plans keeps that room. What
-    is no surface gives way, by `THINNER` of its size at most, and where that is too
-    little for links that overlap, so do the balls of surfaces. Links that overlap by
-    more than that makes up for are not kept apart, and those two joints apart, as in a
-    hip, where they are nearer than `TOUCHING`: they are built around each other, and
-    the shapes stand for more than is there.
+    is no surface gives way, by `THINNER` of its size at most, and so do the balls of
+    surfaces where they overlap something. Links that overlap by more than that makes
+    up for, or by more than `ROOM` without these balls, are not kept apart, and those
+    two joints apart, as in a hip, where they are nearer than `TOUCHING`: they are built
+    around each other, and the shapes stand for more than is there.
 
     Returns:
         The shapes, names of links that are not kept apart, and of shapes made thinner.
@@ -396,10 +396,11 @@ def with_room(
                 links = trial.body(i).name, trial.body(j).name
                 names = trial.geom(a).name, trial.geom(b).name
                 gives = [n for n in names if n in links_only]
-                if d <= min(0.0, ROOM - sum(most[n] for n in gives)):
-                    gives = [n for n in names if n in links_only | balls]
+                deepest = -ROOM
+                if d <= 0.0 and balls.intersection(names):
+                    gives, deepest = [n for n in names if n in links_only | balls], -1.0
                 won = sum(most[n] for n in gives)
-                limit = TOUCHING if two else min(0.0, ROOM - won)
+                limit = TOUCHING if two else min(0.0, max(deepest, ROOM - won))
                 near.append((d, limit, links, gives))
     apart = {links: None for d, limit, links, _ in near if d <= limit}
     lack: dict[str, float] = {}
