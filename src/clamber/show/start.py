@@ -19,6 +19,7 @@ from clamber.model.propose import propose_robot
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import NEAR_FACE, Box, Scene
 from clamber.model.terrain import load_scene
+from clamber.model.wheels import MODELS, model_of
 from clamber.model.world import build_world
 from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
@@ -117,11 +118,8 @@ class StartPage:
         text = "A person's motion, a robot, and something to climb."
         gui.add_html(paragraphs([text]))
         demos = {f"{name} (synthetic)": name for name in BUILT_IN}
-        robots = {p.parent.name: p.parent.name for p in ROBOTS.glob("*/robot.yaml")}
-        own = {str(p.parent): str(p) for p in OWN_ROBOTS.glob("*/robot.yaml")}
-        robots = dict(sorted(robots.items())) | dict(sorted(own.items()))
         self._demo = Choice(page, "recording", demos, _recording, lambda: None)
-        self._robot = Choice(page, "robot", robots, _robot, self._draw)
+        self._robot = Choice(page, "robot", known_robots(), _robot, self._draw)
         self._scene = Choice(page, "scene", {ONE_BOX: ""}, _scene, self._draw)
         with gui.add_folder("Box"):
             self._height = gui.add_slider("height [m]", LOWEST, HIGHEST, 0.005, HEIGHT)
@@ -209,6 +207,7 @@ class StartPage:
             part.visible = one
         try:
             scene = Scene.from_height(LOWEST) if one else load_scene(self._scene.value)
+            make_of_wheel(self._robot.value)
             world = build_world(load_robot(self._robot.value), scene)
         except (ClamberError, OSError) as e:
             self._work.say(str(e))
@@ -268,6 +267,31 @@ def outcome(climb: Climb, result: ClimbResult) -> str:
     """How it ended, and the line that does it again."""
     ended = "The robot made it." if result.reached else f"It did not: {result.why}."
     return f"{ended} The same from a terminal: {command_of(climb)}"
+
+
+# Robots by name.
+
+
+def known_robots() -> dict[str, str]:
+    """Built-in ones, those below `robots/`, and those of installed wheels."""
+    built_in = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))
+    own = sorted(OWN_ROBOTS.glob("*/robot.yaml"))
+    made = {p.parent.name for p in own}
+    carried = [n for n in MODELS if n not in made and model_of(n) is not None]
+    return (
+        {name: name for name in built_in}
+        | {str(p.parent): str(p) for p in own}
+        | {f"{name} (of a wheel)": name for name in carried}
+    )
+
+
+def make_of_wheel(robot: str) -> None:
+    """Propose a wheel's robot, as and where `clamber robot init` does, at first."""
+    folder = OWN_ROBOTS / robot
+    if robot in MODELS and not folder.exists():
+        proposal = propose_robot(robot)
+        folder.mkdir(parents=True)
+        save_proposal(proposal, folder)
 
 
 # Files that are brought.
