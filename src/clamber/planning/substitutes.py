@@ -8,7 +8,7 @@ Where a limb offers several surfaces in one of these sets, it can do with one: t
 an alternative for each combination, and a combination is kept through the whole plan.
 Of those that are stable, the best has the least
 
-    sum over the contacts that are made of (way of the surface to it + d)
+    sum over the contacts that are made of (swing distance of the surface + d)
 
 with d the projected distance (4.17) of the new contact. Besides, elbows can stand in
 for hands (`stand_ins`): no wrist has to bear.
@@ -161,7 +161,7 @@ def without_surfaces(
 
 @checks_types
 def plan_cost(made: Plan) -> float:
-    """Way of the surfaces to their contacts, and projected distances, summed [m].
+    """Swing distances of the surfaces, and projected distances, summed [m].
 
     The way is the straight line from where a surface is before the move, the shortest
     that there is. A step that has no path counts with what is wanted of it, from the

@@ -265,7 +265,7 @@ class StartPage:
 
 def outcome(climb: Climb, result: ClimbResult) -> str:
     """How it ended, and the line that does it again."""
-    ended = "The robot made it." if result.reached else f"It did not: {result.why}."
+    ended = "The robot got there." if result.reached else f"It did not: {result.why}."
     return f"{ended} The same from a terminal: {command_of(climb)}"
 
 
