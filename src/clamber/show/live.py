@@ -176,7 +176,7 @@ def _show_recording(page: Page, skeleton: Skeleton) -> None:
 
 
 def _add_verdict(page: Page, verdict: Mapping[str, Any]) -> None:
-    """Whether the robot got there, and each criterion, from fields of `verdict.json`."""
+    """Whether the robot got there, and each criterion: fields of `verdict.json`."""
     reached, gui = bool(verdict.get("reached")), page.server.gui
     colour = "#16a34a" if reached else "#dc2626"
     said = "reached the goal" if reached else "did not make it"
