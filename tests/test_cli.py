@@ -9,14 +9,12 @@ import json
 import os
 import pty
 import re
-import shutil
 import struct
 import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,10 +25,8 @@ import pytest
 
 import clamber
 from clamber import cli
-from clamber.cli import aside, commands, flags, output, tools
-from clamber.errors import InputError
+from clamber.cli import flags, output, tools
 from clamber.execution.verdict import Figure, judge
-from clamber.show import pictures, renderer
 from conftest import ROOT
 from support.files import write_take
 
@@ -303,7 +299,6 @@ def test_a_plan_and_its_run_leave_the_files_of_the_format(
 def quick_climb(one_hand_plan, one_hand_rollout, monkeypatch: Patch) -> SimpleNamespace:
     """A climb whose stages answer at once, and what was asked of them, in order."""
     said = SimpleNamespace(calls=[], plan=one_hand_plan, drawing={}, no_opengl=False)
-    said.aside = []
     said.verdict = judge(one_hand_plan, one_hand_rollout)
 
     def note(name: str, answer: Callable[..., Any]) -> None:
@@ -319,20 +314,6 @@ def quick_climb(one_hand_plan, one_hand_rollout, monkeypatch: Patch) -> SimpleNa
             raise clamber.ClamberError("no OpenGL")
         return []
 
-    @contextlib.contextmanager
-    def drawing_aside() -> Iterator[Callable[..., Future[None]]]:
-        def draw_aside(folder: Path, **options: Any) -> Future[None]:
-            said.aside.append((*options["parts"], len(said.calls)))
-            done: Future[None] = Future()
-            if said.no_opengl:
-                done.set_exception(clamber.ClamberError("no OpenGL"))
-            else:
-                done.set_result(None)
-            return done
-
-        yield draw_aside
-
-    monkeypatch.setattr(commands, "drawing_aside", drawing_aside)
     for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
         note(name, getattr(clamber, name))
     note("plan", lambda *_, **__: said.plan)
@@ -351,9 +332,6 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
     saved = ["save_sequence", "plan", "save_plan", "simulate", "save_rollout", "judge"]
     assert quick_climb.calls == [*saved, "save_verdict", "render_run"]
     assert quick_climb.drawing["with_video"] is True
-    assert quick_climb.drawing["parts"] == ("plots",)
-    before_physics, after = saved.index("simulate"), len(saved) + 1
-    assert quick_climb.aside == [("plan", before_physics), ("climb", after)]
     row = next(r for r in out.splitlines() if r.startswith("air -> LHand on box"))
     key = quick_climb.plan.keyframes[-1]
     for value in (
@@ -384,24 +362,6 @@ def test_the_seconds_of_a_search_are_those_of_all_of_it(
     written = json.loads((tmp_path / "a" / "timings.json").read_text())["seconds"]
     assert {k: written[k] for k in seconds} == seconds
     assert "plan" not in written
-
-
-@pytest.mark.pool
-def test_a_plan_is_drawn_in_another_process_as_in_this_one(
-    folder: Path, tmp_path: Path
-):
-    if renderer.gl_backend() is None:
-        pytest.skip("no OpenGL here")
-    shutil.copytree(folder / "run", tmp_path / "run")
-    with aside.drawing_aside() as draw:
-        drawn = draw(tmp_path / "run", parts=("plan",))
-        nowhere = draw(tmp_path, parts=("plan",))
-        assert drawn.result() is None
-        with pytest.raises(InputError, match=r"plan\.json: expected a readable file"):
-            nowhere.result()
-    (here,) = pictures.render_run(folder / "run", with_video=False, parts=("plan",))
-    assert {p.name for p in (tmp_path / "run").glob("*.png")} == {here.name}
-    assert (tmp_path / "run" / here.name).read_bytes() == here.read_bytes()
 
 
 def test_a_plan_without_any_step_is_not_simulated(

@@ -8,11 +8,9 @@ functions in order, as `clamber.<name>`: those are imported on first use, so tha
 
 from __future__ import annotations
 
-import functools
 import json
 import sys
-from collections.abc import Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Future
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,7 +18,6 @@ from typing import Annotated, Any, Literal
 import tyro
 
 import clamber
-from clamber.cli.aside import drawing_aside
 from clamber.cli.flags import (
     ExecutionFlags,
     Flat,
@@ -95,29 +92,24 @@ class ClimbCommand:
         )
         clock = Clock()
         track = Track("detect", *PLANNING, *EXECUTION, *_drawing(self.video))
-        with drawing_aside() as draw:
-            with self.output.progress(track, more=True) as show:
-                report = clock.watching(show)
-                report("detect", 0.0, "")
-                demo = self.recorded.load(self.demo, None)
-                sequence = clamber.detect_contacts(demo)
-                report("detect", 1.0, "; ".join(demo.notes[:1]))
-                folder = clamber.new_run_folder(self.out, "climb")
-                with filling(folder), self.world.blamed():
-                    clamber.save_sequence(sequence, folder / "sequence.json")
-                    plan = _plan(
-                        sequence, robot, scene, self.planning, folder, report, others
-                    )
-                    shown = {"demonstration": (demo, sequence)}
-                    drawn = [draw(folder, parts=("plan",), **shown)]
-                    done = self.execution.simulate(plan, folder, report, None)
-            usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
-            self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
-            code = conclude(self.output, folder, plan, done, clock)
-            if done is not None:
-                drawn.append(draw(folder, parts=("climb",)))
-            shown |= {"parts": ("plots",), "with_video": self.video}
-            _draw(self.output, folder, clock, track, drawn, **shown)
+        with self.output.progress(track, more=True) as show:
+            report = clock.watching(show)
+            report("detect", 0.0, "")
+            demo = self.recorded.load(self.demo, None)
+            sequence = clamber.detect_contacts(demo)
+            report("detect", 1.0, "; ".join(demo.notes[:1]))
+            folder = clamber.new_run_folder(self.out, "climb")
+            with filling(folder), self.world.blamed():
+                clamber.save_sequence(sequence, folder / "sequence.json")
+                plan = _plan(
+                    sequence, robot, scene, self.planning, folder, report, others
+                )
+                done = self.execution.simulate(plan, folder, report, None)
+        usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
+        self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
+        code = conclude(self.output, folder, plan, done, clock)
+        shown = {"demonstration": (demo, sequence), "with_video": self.video}
+        _draw(self.output, folder, clock, track, **shown)
         return code
 
 
@@ -510,19 +502,16 @@ def _draw(
     folder: Path,
     clock: Clock,
     track: Track,
-    aside: Sequence[Future[None]] = (),
     **options: Any,
 ) -> None:
-    """Pictures, which nobody need wait for, and those that are drawn `aside`."""
-    missing: dict[str, None] = {}  # each reason once
+    """Pictures, which nobody need wait for."""
+    missing = ()
     with output.progress(track) as show, filling(folder):
         report = clock.watching(show)
-        here = functools.partial(clamber.render_run, folder, report=report, **options)
-        for drawn in (here, *(x.result for x in aside)):
-            try:
-                drawn()
-            except (ClamberError, BrokenExecutor) as e:  # it has made it all the same
-                missing[str(e)] = None
+        try:
+            clamber.render_run(folder, report=report, **options)
+        except ClamberError as e:  # it has made it all the same
+            missing = (str(e),)
         _save_timings(folder, clock)
     output.warn(*missing)
 

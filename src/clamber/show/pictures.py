@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -67,8 +66,6 @@ from clamber.step.posture import Keyframe
 
 CLIMB_FRAMES = 12
 PLOTS = 14.0  # of a run take as long as so many pictures of a sheet
-Part = Literal["plan", "plots", "climb"]
-PARTS: tuple[Part, ...] = ("plan", "plots", "climb")
 SAMPLES = 400  # of a plot over time
 FRAME_SIZE = (1920, 1080)
 CLOSE = 0.12  # [height of the motion] around it boxes are in a sheet's pictures
@@ -281,7 +278,6 @@ def render_run(
     *,
     with_video: bool = True,
     demonstration: tuple[Demonstration, ContactSequence] | None = None,
-    parts: Collection[Part] = PARTS,
     report: Report | None = None,
 ) -> list[Path]:
     """Draw all there is to draw of a run folder, plots first.
@@ -291,8 +287,6 @@ def render_run(
         with_video: Also the video, which takes the longest.
         demonstration: The recording and what was found in it; by default, in a video,
             what the plan names, where it is at hand.
-        parts: What is drawn: the recording and the plan, plots of what physics did,
-            the sheet of it.
         report: Told of stage, share done and a note.
 
     Raises:
@@ -305,11 +299,8 @@ def render_run(
     plan, rollout, broken = _readable(folder)
     files: list[Path] = []
     # What there is to draw is known beforehand, in pictures of a sheet.
-    with_plots = rollout is not None and "plots" in parts
-    with_climb = rollout is not None and "climb" in parts
-    drawn, plots = 0.0, PLOTS if with_plots else 0.0
-    keyframes = float(len(plan.keyframes)) if "plan" in parts else 0.0
-    sheets = [keyframes, CLIMB_FRAMES if with_climb else 0]
+    drawn, plots = 0.0, 0.0 if rollout is None else PLOTS
+    sheets = [float(len(plan.keyframes)), 0.0 if rollout is None else CLIMB_FRAMES]
     whole = plots + sum(sheets)
 
     def within(count: float) -> Report:
@@ -318,22 +309,21 @@ def render_run(
         )
 
     tell("pictures", 0.0, "plots")
-    if demonstration is not None and "plan" in parts:
+    if demonstration is not None:
         files.append(demonstration_plot(*demonstration, folder / "demonstration.png"))
-    if rollout is not None and with_plots:
+    if rollout is not None:
         motion = sample_motion(plan, rollout, {}, SAMPLES)
         tell("pictures", plots / 2 / whole, "plots")
         asked = plan.options.keyframe.balance_margin
         files.append(contact_plot(motion, folder / "contacts.png"))
         files.append(stability_plot(motion, asked, folder / "stability.png"))
-    if plan.iterations and "plan" in parts:
+    if plan.iterations:
         files.append(cost_to_go_plot(plan, folder / "cost-to-go.png"))
     drawn = plots
-    if "plan" in parts:
-        report_sheet, path = within(sheets[0]), folder / "keyframes.png"
-        files.append(keyframe_sheet(plan, path, report=report_sheet))
+    report_sheet, path = within(sheets[0]), folder / "keyframes.png"
+    files.append(keyframe_sheet(plan, path, report=report_sheet))
     drawn += sheets[0]
-    if rollout is not None and with_climb:
+    if rollout is not None:
         report_sheet = within(sheets[1])
         files.append(climb_sheet(rollout, folder / "climb.png", report=report_sheet))
     tell("pictures", 1.0, "")
