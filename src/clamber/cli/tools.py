@@ -330,11 +330,13 @@ class RobotCommand:
 
     def run(self) -> int:
         """Description to a proposal, or a robot file to what a planner sees of it."""
+        from clamber.model.robot import PROPOSED
+
         notes: list[str] = []
         path, out = self.model, self.out
         if self.action == "init":
             proposal = clamber.propose_robot(self.model, effort_from=self.effort)
-            out = out or Path("robots") / proposal.name
+            out = out or PROPOSED / proposal.name
             if out.exists() and (not out.is_dir() or any(out.iterdir())):
                 raise InputError("a new or empty folder", "--out", value=str(out))
             out = clamber.new_run_folder(out, "robot")

@@ -26,7 +26,7 @@ from clamber.model.records import short_repr
 from clamber.model.shown import Viewed
 from clamber.model.terrain import SceneLike, load_scene
 from clamber.model.world import PHYSICS_STEP, World
-from clamber.planning.records import Plan
+from clamber.planning.records import Plan, silent
 from clamber.planning.trajectory import Trajectory
 
 STRIDE = 10  # physics steps between two recorded states
@@ -136,7 +136,7 @@ def simulate(
     rng = np.random.default_rng([d.seed, 1])
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
     push = push_of(d, float(plan.trajectory.time[-1]))
-    report = progress or (lambda stage, share, note: None)
+    report = progress or silent
     model = world.model
     data = mujoco.MjData(model)
     start = world.home if plan.state is None else plan.state.q

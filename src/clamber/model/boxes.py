@@ -125,40 +125,34 @@ def _pieces(
         return by_eight
     called: dict[int, str | None] = {i: n for n, f in faces for i in f}
     for merged in (False, True):
-        root = _joined(v, [f for _, f in faces], merged)
+        solid = _joined(v, [f for _, f in faces], merged)
         solids: dict[int, list[int]] = {}
         for i in range(len(v)):
-            solids.setdefault(int(root[i]), []).append(i)
+            solids.setdefault(int(solid[i]), []).append(i)
         if merged or all(len(rows) == 8 for rows in solids.values()):
             break
     return [(called[rows[0]], rows) for rows in solids.values()]
 
 
 def _joined(v: np.ndarray, faces: list[list[int]], merged: bool) -> np.ndarray:
-    """(N,) the least vertex to which each is joined by faces.
+    """(N,) which vertices are joined by faces: the same number.
 
     Args:
         v: (N, 3) vertices.
         faces: Indices.
         merged: Whether vertices at one place are joined too.
     """
-    root = np.arange(len(v))
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     links = [(f[0], i) for f in faces for i in f[1:]]
     if merged:
         same: dict[tuple, int] = {}
         for i, place in enumerate(map(tuple, _rounded(v).tolist())):
             links.append((same.setdefault(place, i), i))
-
-    def find(i: int) -> int:
-        while root[i] != i:
-            root[i] = root[root[i]]
-            i = int(root[i])
-        return i
-
-    for a, b in links:
-        x, y = sorted((find(a), find(b)))
-        root[y] = x
-    return np.array([find(i) for i in range(len(v))])
+    ends = np.array(links, dtype=np.intp).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(links)), tuple(ends)), shape=(len(v), len(v)))
+    return connected_components(graph, directed=False)[1]
 
 
 def _rounded(v: np.ndarray) -> np.ndarray:

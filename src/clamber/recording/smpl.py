@@ -159,7 +159,10 @@ def _kinematics(
     angles: np.ndarray, rest: np.ndarray, parents: np.ndarray
 ) -> np.ndarray:
     """(T, J, 3) joints for rotation vectors (T, J, 3), the pelvis at its rest place."""
-    R = _rotations(angles)
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_rotvec(angles.reshape(-1, 3))
+    R = turns.as_matrix().reshape(*angles.shape, 3)
     out = np.empty_like(angles)
     out[:, 0] = rest[0]
     turned = [R[:, 0]]
@@ -168,14 +171,3 @@ def _kinematics(
         out[:, j] = out[:, parents[j]] + above @ (rest[j] - rest[parents[j]])
         turned.append(above @ R[:, j])
     return out
-
-
-def _rotations(v: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) of rotation vectors (..., 3) [Rodrigues]."""
-    angle = np.linalg.norm(v, axis=-1, keepdims=True)
-    x, y, z = np.moveaxis(v / np.where(angle > 0, angle, 1.0), -1, 0)
-    zero = np.zeros_like(x)
-    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    K = K.reshape(*v.shape[:-1], 3, 3)
-    s, c = np.sin(angle)[..., None], np.cos(angle)[..., None]
-    return np.eye(3) + s * K + (1.0 - c) * (K @ K)

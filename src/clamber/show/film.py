@@ -23,7 +23,7 @@ from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import World
-from clamber.planning.records import Plan
+from clamber.planning.records import Plan, silent
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.codec import whole_file
@@ -37,13 +37,18 @@ from clamber.show.renderer import (
     ball,
     bar,
     block,
-    box_corners,
     flat_axes,
     seen_points,
     view_of,
 )
 from clamber.show.sample import change_at, keyframe_times, thinned
-from clamber.show.skeleton import Skeleton, paired_times, recording_named, skeleton_of
+from clamber.show.skeleton import (
+    Skeleton,
+    corners,
+    paired_times,
+    recording_named,
+    skeleton_of,
+)
 
 Marks = Literal["none", "contacts", "forces"]
 FPS = 20
@@ -82,8 +87,7 @@ class Person:
             np.where(skeleton.seen[..., None], skeleton.position, np.nan), 60
         )
         valid = valid.reshape(-1, 3)
-        mine = [valid[np.isfinite(valid).all(axis=1)]]
-        mine += [box_corners(b.size, b.position, b.rotation) for b in demo.scene.boxes]
+        mine = (valid[np.isfinite(valid).all(axis=1)], corners(demo.scene))
         there = s * np.concatenate(mine) @ R.T
         right, forward = flat_axes(world, camera)
         room = ROOM * float(np.ptp(seen[:, 2]))
@@ -189,7 +193,7 @@ def video(
         raise MissingDependency("imageio-ffmpeg", "video")
     fps, usual = (FPS, VIDEO_SIZE) if path.suffix == ".mp4" else (FPS / 2, WEBP_SIZE)
     size = size or usual
-    tell = report or (lambda stage, share, note: None)
+    tell = report or silent
     frames = _frames(plan, rollout, fps, size, camera, marks, skeleton, tell)
     with whole_file(path) as draft:
         if path.suffix == ".mp4":

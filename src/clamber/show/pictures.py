@@ -19,7 +19,7 @@ from clamber.model.robot import RobotLike
 from clamber.model.scene import GROUND, Scene
 from clamber.model.terrain import SceneLike
 from clamber.model.world import World, build_world
-from clamber.planning.records import Plan
+from clamber.planning.records import Plan, silent
 from clamber.recording.demonstration import Demonstration
 from clamber.run.codec import whole_file
 from clamber.run.folder import (
@@ -295,15 +295,15 @@ def render_run(
         ClamberError: There is no OpenGL for pictures; the plots are done by then.
     """
     folder = Path(folder)
-    tell = report or (lambda stage, share, note: None)
+    tell = report or silent
     plan, rollout, broken = _readable(folder)
     files: list[Path] = []
     # What there is to draw is known beforehand, in pictures of a sheet.
-    drawn, plots = 0.0, 0.0 if rollout is None else PLOTS
-    sheets = [float(len(plan.keyframes)), 0.0 if rollout is None else CLIMB_FRAMES]
-    whole = plots + sum(sheets)
+    plots, frames = (0.0, 0.0) if rollout is None else (PLOTS, float(CLIMB_FRAMES))
+    keyframes = float(len(plan.keyframes))
+    whole = plots + keyframes + frames
 
-    def within(count: float) -> Report:
+    def within(drawn: float, count: float) -> Report:
         return lambda stage, share, note: tell(
             stage, (drawn + share * count) / whole, note
         )
@@ -319,19 +319,16 @@ def render_run(
         files.append(stability_plot(motion, asked, folder / "stability.png"))
     if plan.iterations:
         files.append(cost_to_go_plot(plan, folder / "cost-to-go.png"))
-    drawn = plots
-    report_sheet, path = within(sheets[0]), folder / "keyframes.png"
-    files.append(keyframe_sheet(plan, path, report=report_sheet))
-    drawn += sheets[0]
+    now = within(plots, keyframes)
+    files.append(keyframe_sheet(plan, folder / "keyframes.png", report=now))
     if rollout is not None:
-        report_sheet = within(sheets[1])
-        files.append(climb_sheet(rollout, folder / "climb.png", report=report_sheet))
+        now = within(plots + keyframes, frames)
+        files.append(climb_sheet(rollout, folder / "climb.png", report=now))
     tell("pictures", 1.0, "")
-    if rollout is not None:
-        if with_video:
-            known = demonstration is not None
-            person = skeleton_of(*demonstration) if known else skeleton_of_plan(plan)
-            files.append(video(plan, rollout, folder, skeleton=person, report=tell))
+    if rollout is not None and with_video:
+        known = demonstration is not None
+        person = skeleton_of(*demonstration) if known else skeleton_of_plan(plan)
+        files.append(video(plan, rollout, folder, skeleton=person, report=tell))
     if broken is not None:
         raise broken
     return files

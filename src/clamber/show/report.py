@@ -40,7 +40,7 @@ from clamber.run.codec import whole_file
 from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, fallback_note
 from clamber.show.marks import FORCE_LENGTH
 from clamber.show.meshes import Mesh, body_meshes, body_poses
-from clamber.show.renderer import PRESETS, seen_points
+from clamber.show.renderer import PRESETS, box_corners, seen_points
 from clamber.show.sample import (
     keyframe_times,
     read_run,
@@ -317,7 +317,6 @@ def _poses(kin: Kinematics, meshes: list[Mesh], q: np.ndarray) -> np.ndarray:
 
 def _box_edges(model: mujoco.MjModel) -> list[float]:
     """Ends of the edges of the boxes that stand in the world [m], 6 numbers an edge."""
-    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     ends = [(a, b) for a in range(8) for b in (a | 1, a | 2, a | 4) if b > a]
     out: list[float] = []
     for g in np.flatnonzero(model.geom_bodyid == 0):
@@ -325,7 +324,8 @@ def _box_edges(model: mujoco.MjModel) -> list[float]:
             continue
         R = np.zeros(9)
         mujoco.mju_quat2Mat(R, model.geom_quat[g])
-        points = corner * model.geom_size[g] @ R.reshape(3, 3).T + model.geom_pos[g]
+        size = 2 * model.geom_size[g]
+        points = box_corners(size, model.geom_pos[g], R.reshape(3, 3))
         out += np.round(points[np.array(ends)], 5).ravel().tolist()
     return out
 

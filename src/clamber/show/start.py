@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import yaml
 from clamber.errors import ClamberError, InputError
 from clamber.model.kinematics import Kinematics
 from clamber.model.propose import propose_robot
-from clamber.model.robot import ROBOTS, load_robot
+from clamber.model.robot import PROPOSED, ROBOTS, load_robot
 from clamber.model.scene import NEAR_FACE, Box, Scene
 from clamber.model.terrain import load_scene
 from clamber.model.wheels import MODELS, model_of
@@ -32,7 +33,6 @@ from clamber.show.scene3d import DEVIATION, PERSON_BOX, TRIANGLES, Bodies
 from clamber.study.climb import Climb, ClimbResult, command_of, run_climb
 
 UPLOADS = Path("runs") / "uploads"
-OWN_ROBOTS = Path("robots")  # where `clamber robot init` writes them
 ONE_BOX = "one box"
 HEIGHT, LOWEST, HIGHEST = 0.275, 0.05, 0.6  # [m] of the box
 NEAREST, FARTHEST = NEAR_FACE, 0.6  # [m] of its face, from the ankles
@@ -176,13 +176,7 @@ class StartPage:
         """As the sliders say."""
         (box,) = Scene.from_height(round(float(self._height.value), 4)).boxes
         away = float(self._distance.value) - NEAREST
-        return Box(
-            name=box.name,
-            size=box.size,
-            position=box.position + np.array([away, 0.0, 0.0]),
-            rotation=box.rotation,
-            friction=box.friction,
-        )
+        return replace(box, position=box.position + np.array([away, 0.0, 0.0]))
 
     # What it looks like.
 
@@ -208,7 +202,7 @@ class StartPage:
         try:
             scene = Scene.from_height(LOWEST) if one else load_scene(self._scene.value)
             make_of_wheel(self._robot.value)
-            world = build_world(load_robot(self._robot.value), scene)
+            world = build_world(self._robot.value, scene)
         except (ClamberError, OSError) as e:
             self._work.say(str(e))
             return
@@ -275,7 +269,7 @@ def outcome(climb: Climb, result: ClimbResult) -> str:
 def known_robots() -> dict[str, str]:
     """Built-in ones, those below `robots/`, and those of installed wheels."""
     built_in = sorted(p.parent.name for p in ROBOTS.glob("*/robot.yaml"))
-    own = sorted(OWN_ROBOTS.glob("*/robot.yaml"))
+    own = sorted(PROPOSED.glob("*/robot.yaml"))
     made = {p.parent.name for p in own}
     carried = [n for n in MODELS if n not in made and model_of(n) is not None]
     return (
@@ -287,11 +281,16 @@ def known_robots() -> dict[str, str]:
 
 def make_of_wheel(robot: str) -> None:
     """Propose a wheel's robot, as and where `clamber robot init` does, at first."""
-    folder = OWN_ROBOTS / robot
+    folder = PROPOSED / robot
     if robot in MODELS and not folder.exists():
-        proposal = propose_robot(robot)
-        folder.mkdir(parents=True)
-        save_proposal(proposal, folder)
+        _propose(robot, folder)
+
+
+def _propose(model: str | Path, folder: Path) -> None:
+    """Write what is proposed of a model to a new folder."""
+    proposal = propose_robot(model)
+    folder.mkdir(parents=True)
+    save_proposal(proposal, folder)
 
 
 # Files that are brought.
@@ -309,8 +308,7 @@ def _robot(file: Path) -> str:
         load_robot(file)
         return str(file)
     proposed = file.parent / "robot"
-    proposed.mkdir()
-    save_proposal(propose_robot(file), proposed)
+    _propose(file, proposed)
     robot = proposed / "robot.yaml"
     load_robot(robot)
     return str(robot)

@@ -28,6 +28,7 @@ from clamber.errors import ClamberError, InputError, MissingDependency, unreadab
 from clamber.model.arguments import checks_types
 from clamber.model.robot import load_robot
 from clamber.model.terrain import load_scene
+from clamber.planning.records import Progress, silent
 from clamber.recording.recording import load_demo
 from clamber.run.codec import whole_file
 from clamber.study.climb import ClimbResult, command_of, run_climb
@@ -43,7 +44,6 @@ CONNECT = 10.0  # [s] in which a scheduler has to answer
 CRASHED = "error: "  # begins `why` where a job raised what it never should
 
 JobFunction = Callable[[Any], ClimbResult]
-Progress = Callable[[str, float, str], None]
 Rows = list[tuple[Run, ClimbResult]]
 
 
@@ -112,7 +112,7 @@ def run_sweep(
             scheduler's address.
         ClamberError: Workers die again and again.
     """
-    report = progress or (lambda stage, share, note: None)
+    report = progress or silent
     folder = Path(folder)
     with _table(spec, folder) as table:
         todo = _Todo(spec, table.done)
