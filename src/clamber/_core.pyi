@@ -484,8 +484,29 @@ class Workspace:
         contact_values: np.ndarray,
         prices: np.ndarray,
         q: np.ndarray,
+        inertia: np.ndarray,
     ) -> np.ndarray:
-        """(n, na) torques that hold postures (n, nq); prices (n, k), or 0."""
+        """(n, na) torques that hold postures (n, nq); prices (n, k), or 0.
+
+        Against generalised forces (n, nv) of inertia besides gravity's, or (0, 0).
+        """
+
+    def time_law(
+        self,
+        contacts: Sequence[tuple[np.ndarray, np.ndarray]],
+        stance: np.ndarray,
+        q: np.ndarray,
+        slope: np.ndarray,
+        inertia: np.ndarray,
+        velocity: np.ndarray,
+        limits: np.ndarray,
+        damping: np.ndarray,
+        share: float,
+    ) -> np.ndarray:
+        """(n,) squared rate of the fastest law along a path.
+
+        Limits (4, n): s, bounds of |u|, of x, of |u| + x where not even rest is borne.
+        """
 
     def bridge(
         self,

@@ -50,6 +50,24 @@ void Holding::look(Kinematics& kin, const std::vector<Contact>& contacts) {
         const double spared = bears[model_.dadr[j]] ? SPARED_ARM * weight : 0.0;
         limits_[j] = std::max(EFFORT_SHARE * most - spared, LEAST_SHARE * most);
     }
+    std::copy_n(LoadView{}.wrench, 6, wrench_);
+}
+
+void Holding::wrench_of(const Kinematics& kin, const double* force, double* wrench) const {
+    // The free joint: a force in the world, at the base's origin, a moment in its axes.
+    const double scale = 1.0 / (model_.mass * GRAVITY);
+    const Vec3 f = read3(force) * scale;
+    const Vec3 m = matrix(kin.quat(model_.base)) * (read3(force + 3) * scale) +
+                   cross(kin.pos(model_.base) - com_, f);
+    write3(f, wrench);
+    write3(m, wrench + 3);
+}
+
+void Holding::add(const Kinematics& kin, const double* force) {
+    double more[6];
+    wrench_of(kin, force, more);
+    for (int i = 0; i < 6; ++i) wrench_[i] += more[i];
+    for (int d = 0; d < model_.nv; ++d) gravity_[d] += force[d];
 }
 
 ContactPointsView Holding::points() const {
@@ -65,6 +83,7 @@ LoadView Holding::load() const {
     LoadView out;
     write3(com_, out.com);
     out.mass = model_.mass;
+    std::copy_n(wrench_, 6, out.wrench);
     return out;
 }
 

@@ -25,10 +25,14 @@ class Holding {
 
     // Look at contacts at the present posture.
     void look(Kinematics& kin, const std::vector<Contact>& contacts);
+    // Of a generalised force (nv): its wrench about the centre of mass, in weights.
+    void wrench_of(const Kinematics& kin, const double* force, double* wrench) const;
+    // The robot moves: more than its weight is to be borne, by a generalised force (nv).
+    void add(const Kinematics& kin, const double* force);
     // Wrench and torques left over by the least forces, in weights: within
     // `BALANCE_TOL` where friction cones and torques that are counted on hold the robot.
     double residual();
-    // (na) torques that balance gravity with the least contact forces; where these ask
+    // (na) torques that balance what is looked at with the least contact forces; where these ask
     // more of a joint than is counted on, with those that do not. `price` of a force at
     // each contact, or none.
     void torques(const double* price, double* tau);
@@ -45,6 +49,7 @@ class Holding {
     const Model& model_;
     Statics statics_;
     Vec3 com_;
+    double wrench_[6];
     std::vector<std::array<double, 3>> points_, normals_, forces_;
     std::vector<double> mu_, jacobian_, gravity_, limits_, price_;
     std::vector<int> owner_;

@@ -312,8 +312,11 @@ bool PathPlanner::is_stable(const std::vector<Contact>& contacts, const double* 
 }
 
 void PathPlanner::holding_torques(const std::vector<Contact>& contacts,
-                                  const double* price, const double* q, double* tau) {
-    look(contacts, q).torques(price, tau);
+                                  const double* price, const double* q,
+                                  const double* inertia, double* tau) {
+    Holding& held = look(contacts, q);
+    if (inertia) held.add(solver.kin, inertia);
+    held.torques(price, tau);
 }
 
 // Overlaps and contacts at all postures and half-way between, solver aside. Whether the

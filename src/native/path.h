@@ -65,9 +65,10 @@ class PathPlanner {
     bool is_stable(const std::vector<Contact>& contacts, const double* q);
     // The same, to be asked more.
     Holding& look(const std::vector<Contact>& contacts, const double* q);
-    // (na) torques that hold it there, a force at each contact at its price.
+    // (na) torques that hold it there, a force at each contact at its price; against a
+    // generalised force (nv) besides its weight, or none.
     void holding_torques(const std::vector<Contact>& contacts, const double* price,
-                         const double* q, double* tau);
+                         const double* q, const double* inertia, double* tau);
 
     Solver solver;
 

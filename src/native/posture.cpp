@@ -9,6 +9,7 @@
 
 #include "bindings.h"
 #include "path.h"
+#include "timing.h"
 
 namespace clamber {
 
@@ -449,12 +450,18 @@ void bind_posture(nb::module_& m) {
              "of a body's point.")
         .def("holding_torques",
              [](Workspace& w, const Array2<int>& what, const Array2<>& where,
-                const Array2<>& prices, const Array2<>& q) {
+                const Array2<>& prices, const Array2<>& q, const Array2<>& inertia) {
                  const auto all = read_contacts(*w.model, what, where);
                  const std::size_t n = q.shape(0), na = w.model->dadr.size();
+                 const std::size_t nv = w.model->nv;
                  check_size(prices.shape(0), n, "prices");
                  check_size(prices.shape(1), all.size(), "prices");
                  check_size(q.shape(1), w.model->nq, "q");
+                 const bool moves = inertia.shape(0) > 0;
+                 if (moves) {
+                     check_size(inertia.shape(0), n, "inertia");
+                     check_size(inertia.shape(1), nv, "inertia");
+                 }
                  std::vector<double> out(n * na);
                  {
                      nb::gil_scoped_release released;
@@ -472,12 +479,53 @@ void bind_posture(nb::module_& m) {
                          }
                          w.planner.holding_torques(bearing, price.data(),
                                                    q.data() + i * w.model->nq,
+                                                   moves ? inertia.data() + i * nv : nullptr,
                                                    out.data() + i * na);
                      }
                  }
                  return own(std::move(out), {n, na});
              },
-             "(n, na) torques that hold postures (n, nq), contacts at prices (n, k) or 0.")
+             "(n, na) torques that hold postures (n, nq), contacts at prices (n, k) or 0; "
+             "against generalised forces (n, nv) of inertia, or (0, 0).")
+        .def("time_law",
+             [](Workspace& w, const std::vector<Packed>& contacts, const Array1<int>& stance,
+                const Array2<>& q, const Array2<>& slope, const Array2<>& inertia,
+                const Array2<>& velocity, const Array2<>& limits, const Array1<>& damping,
+                double share) {
+                 const std::size_t n = q.shape(0), nv = w.model->nv;
+                 std::vector<std::vector<Contact>> stances;
+                 for (const Packed& c : contacts)
+                     stances.push_back(read_contacts(*w.model, std::get<0>(c), std::get<1>(c)));
+                 check_size(n ? q.shape(1) : 0, n ? w.model->nq : 0, "q");
+                 check_size(stance.size(), n, "stance");
+                 for (const Array2<>* x : {&slope, &inertia, &velocity})
+                     check_size(x->size(), n * nv, "generalised forces");
+                 check_size(limits.size(), 4 * n, "limits");
+                 check_size(damping.size(), nv, "damping");
+                 for (std::size_t i = 0; i < n; ++i)
+                     index(stance.data()[i], stances.size(), "stance");
+                 Course course;
+                 course.n = static_cast<int>(n);
+                 course.q = q.data();
+                 course.slope = slope.data();
+                 course.inertia = inertia.data();
+                 course.velocity = velocity.data();
+                 course.stance = stance.data();
+                 course.s = limits.data();
+                 course.u_max = limits.data() + n;
+                 course.x_max = limits.data() + 2 * n;
+                 course.crawl = limits.data() + 3 * n;
+                 course.damping = damping.data();
+                 std::vector<double> x(n, 0.0);
+                 if (n) {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     TimeLaw(w.planner, *w.model).fastest(course, stances, share, x.data());
+                 }
+                 return own(std::move(x));
+             },
+             "(n,) squared rate of the fastest law along a path; limits (4, n): s, bounds of "
+             "|u|, of x, and of |u| + x where not even rest is borne.")
         .def("bridge",
              [](Workspace& w, const Array1<>& a, const Array1<>& b, const Array2<int>& what,
                 const Array2<>& where) {

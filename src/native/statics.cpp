@@ -76,7 +76,7 @@ void load_rows(const ContactPointsView& contacts, const double* com, const Torqu
 
 void Statics::bound_rows(const LoadView& load, const TorqueView& torque, int first) {
     for (int i = first; i < first + 6; ++i) {
-        upper_[i] = lower_[i] = WEIGHT[i - first];
+        upper_[i] = lower_[i] = load.wrench[i - first];
         sense_[i] = EQUALITY;
     }
     const double weight = load.mass * GRAVITY;

@@ -24,6 +24,8 @@ struct ContactPointsView {
 struct LoadView {
     double com[3] = {0.0, 0.0, 0.0};  // [m]
     double mass = 0.0;                // [kg]
+    // Of the contacts about `com` [weights, and times a metre]; more where the robot moves.
+    double wrench[6] = {0.0, 0.0, 1.0, 0.0, 0.0, 0.0};
 };
 
 // |g - J'f| <= limits, joint by joint; none where na is 0.

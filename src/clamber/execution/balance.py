@@ -24,6 +24,7 @@ from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
+from clamber.step.tasks import contact_rows
 
 HIGH, FADE = 0.022, 0.008  # [m] margin at which feedback sets in, and within how much
 SAG = 0.003  # [m] less than the planned margin is no danger
@@ -98,16 +99,8 @@ class Balance:
     def _moved(self) -> np.ndarray:
         """(na,) that moves the centre of mass as is asked for, the contacts held."""
         kin = self._kin
-        rows = [kin.com_jacobian()[:2].copy()]
-        for contact in self._contacts:
-            n = kin.world.supports[contact.support].normal
-            surface = kin.world.surface(contact.surface, contact.edge)
-            p = kin.contact_point(contact.surface, n, contact.edge)
-            linear, angular = kin.jacobians(surface.body, p)
-            rows.append(linear.copy())
-            if surface.is_flat and contact.edge is None:
-                rows.append(angular.copy())
-        A = np.vstack(rows)
+        com = kin.com_jacobian()[:2].copy()
+        A = np.concatenate([com, contact_rows(kin, self._contacts)])
         wanted = np.zeros(len(A))
         wanted[:2] = self._core.shift
         y = np.linalg.solve(A @ A.T + DAMPING * np.eye(len(A)), wanted)

@@ -1,8 +1,8 @@
 """A path in time -> samples of it, 1 kHz, made when they are asked for.
 
-A `Run` is one phase: a spline through its postures, and a velocity profile along it
-that accelerates, cruises and brakes. What it is made from is small, and is what is
-written down of a planned trajectory; its samples are not kept.
+A `Run` is one phase: a spline through its postures, and how far along it the robot is
+at each millisecond. What it is made from is small, and is what is written down of a
+planned trajectory; its samples are not kept.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from scipy.interpolate import CubicSpline
 from clamber import _core
 
 RATE = 1000.0  # [Hz]
-ACCELERATION = 4.0  # [1/s] the cruise speed is reached after a quarter of a second
-MIN_PHASE = 0.2  # [s]
 
 Sampling = Callable[[int], Sequence[np.ndarray]]
 
@@ -134,30 +132,32 @@ class Samples:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Spline:
-    """One phase as a function of its path parameter.
+    """One phase as a function of its path parameter, from 0 on.
 
     Attributes:
         curve: Of the raw coordinates.
         postures: (n, nq) that it goes through.
         nodes: (n,) of the path parameter.
-        held: (n, na) torques there [N m].
-        cruise: ds/dt at which the fastest joint has the speed limit.
+        ends: (2, nq) its derivatives at the first and the last of them.
+        grid: (g,) of the path parameter.
+        tau: (g, na) feed-forward torques there [N m].
     """
 
     curve: CubicSpline
     postures: np.ndarray
     nodes: np.ndarray
-    held: np.ndarray
-    cruise: float
+    ends: np.ndarray
+    grid: np.ndarray
+    tau: np.ndarray
 
     @property
     def length(self) -> float:
         """Path parameter at the end."""
         return float(self.nodes[-1])
 
-    def tau(self, s: np.ndarray) -> np.ndarray:
-        """(T, na) torques, in equal steps between two nodes."""
-        return _core.between_rows(self.held, self.nodes, np.ascontiguousarray(s))
+    def torques(self, s: np.ndarray) -> np.ndarray:
+        """(T, na), linear between two points of the grid."""
+        return _core.between_rows(self.tau, self.grid, np.ascontiguousarray(s))
 
     def along(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T, nq) postures, and (T, nv) their derivatives by the path parameter."""
@@ -165,75 +165,40 @@ class Spline:
 
 
 def spline_through(
-    s: np.ndarray, postures: np.ndarray, held: np.ndarray, cruise: float
+    s: np.ndarray,
+    postures: np.ndarray,
+    ends: np.ndarray,
+    grid: np.ndarray,
+    tau: np.ndarray,
 ) -> Spline:
     """The spline through postures (n, nq) at path parameters (n,); see `Spline`."""
-    ends = "natural" if len(s) > 2 else "not-a-knot"
-    return Spline(CubicSpline(s, postures, bc_type=ends), postures, s, held, cruise)
-
-
-def profile_samples(length: float, cruise: float) -> int:
-    """How many samples a `profile` has."""
-    ramp = 1.5 / ACCELERATION
-    cruise = min(cruise, length / ramp)
-    return int(np.ceil(max(length / cruise + ramp, MIN_PHASE, 2 * ramp) * RATE))
-
-
-@functools.lru_cache(maxsize=2)  # a run's motion and its torques ask for the same
-def profile(length: float, cruise: float, stride: int = 1) -> np.ndarray:
-    """(2, n) s and ds/dt at 1 kHz: smooth rise to the cruise speed, smooth fall.
-
-    The rise is a raised cosine, so that acceleration has no jumps.
-    """
-    n, ramp = profile_samples(length, cruise), 1.5 / ACCELERATION
-    total = n / RATE  # a whole number of samples, else ds/dt is not the derivative
-    t = np.arange(1, n + 1, stride) / RATE
-
-    def rise(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = np.clip(x, 0.0, ramp)
-        return (
-            0.5 * (x - ramp / np.pi * np.sin(np.pi * x / ramp)),
-            0.5 * (1 - np.cos(np.pi * x / ramp)),
-        )
-
-    up, up_rate = rise(t)
-    down, down_rate = rise(total - t)
-    plateau = max(total - 2 * ramp, 0.0)
-    s = np.where(
-        t <= ramp,
-        up,
-        np.where(t <= ramp + plateau, 0.5 * ramp + (t - ramp), ramp + plateau - down),
-    )
-    rate = np.where(t <= ramp, up_rate, np.where(t <= ramp + plateau, 1.0, down_rate))
-    scale = length / (ramp + plateau)
-    out = np.stack([s * scale, rate * scale])
-    out.setflags(write=False)
-    return out
+    curve = CubicSpline(s, postures, bc_type=((1, ends[0]), (1, ends[1])))
+    return Spline(curve, postures, s, ends, grid, tau)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Run:
     """One phase in time, with samples of rest before and after it.
 
-    How far along the path it is and how fast, (2, n), and the torques (n, na) are kept
-    where they are not those of the profile and of the spline.
+    Attributes:
+        spline: The path.
+        timing: (2, n) how far along it, and how fast.
+        lead, rest: Samples before and after.
     """
 
     spline: Spline
-    n: int
-    timing: np.ndarray | None
-    tau: np.ndarray | None
+    timing: np.ndarray
     lead: int
     rest: int
 
     @property
     def samples(self) -> int:
         """How many, rest included."""
-        return self.lead + self.n + self.rest
+        return self.lead + self.timing.shape[1] + self.rest
 
     def motion(self) -> tuple[np.ndarray, np.ndarray]:
         """Configurations and velocities, rest included."""
-        s, rate = self._timed()
+        s, rate = self.timing
         q, v = self.spline.along(s)
         first, _ = self.spline.along(np.zeros(1))
         v *= rate[:, None]
@@ -242,14 +207,8 @@ class Run:
 
     def torques(self) -> np.ndarray:
         """Feed-forward torques, rest included."""
-        tau = self.spline.tau(self._timed()[0]) if self.tau is None else self.tau
-        return self._with_rest(self.spline.tau(np.zeros(1)), tau, tau[-1:])
-
-    def _timed(self) -> np.ndarray:
-        """(2, n) s and ds/dt."""
-        if self.timing is not None:
-            return self.timing
-        return profile(self.spline.length, self.spline.cruise)
+        tau = self.spline.torques(self.timing[0])
+        return self._with_rest(self.spline.torques(np.zeros(1)), tau, tau[-1:])
 
     def _with_rest(
         self, first: np.ndarray, rows: np.ndarray, last: np.ndarray
@@ -257,8 +216,8 @@ class Run:
         """Rows, and those of rest, (1, k) each, before and after them."""
         out = np.empty((self.samples, rows.shape[1]))
         out[: self.lead] = first
-        out[self.lead : self.lead + self.n] = rows
-        out[self.lead + self.n :] = last
+        out[self.lead : self.lead + len(rows)] = rows
+        out[self.lead + len(rows) :] = last
         out.setflags(write=False)
         return out
 
@@ -275,7 +234,7 @@ def sampled(runs: Sequence[Run]) -> dict[str, Samples]:
     def pushing(i: int) -> tuple[np.ndarray]:
         return (runs[i].torques(),)
 
-    postures, torques = runs[0].spline.postures, runs[0].spline.held
+    postures, torques = runs[0].spline.postures, runs[0].spline.tau
     return {
         "q": Samples(moving, 0, stops, postures.shape[1], runs),
         "v": Samples(moving, 1, stops, postures.shape[1] - 1, runs),
@@ -288,51 +247,47 @@ def runs_as_arrays(
 ) -> dict[str, np.ndarray] | None:
     """What q, v and tau of a planned trajectory are sampled from; None of others.
 
-    Of R runs: `run_sizes` (R, 4) of each its nodes, the samples of its own timing, and
-    those of rest before and after it; `run_cruise` (R,) ds/dt at the largest speed. Of
-    all their N nodes: `node_s` (N,), `node_qpos` (N, nq), `node_tau` (N, na). Of the M
-    samples of their own timing: `timed_s` (M, 2) s and ds/dt, `timed_tau` (M, na).
+    Of R runs: `run_sizes` (R, 5) of each its nodes, the points of its grid, its samples
+    and those of rest before and after it; `run_ends` (R, 2, nq) derivatives of the
+    path. Of all their N nodes: `node_s` (N,), `node_qpos` (N, nq). Of all points of
+    grids, G: `grid_s` (G,), `grid_tau` (G, na). Of all M samples: `timed_s` (M, 2) s
+    and ds/dt.
     """
     runs = getattr(samples[0], "runs", ())
     if not runs or any(getattr(x, "runs", ()) is not runs for x in samples):
         return None
-    splines, na = [x.spline for x in runs], runs[0].spline.held.shape[1]
-    timing, tau = [np.zeros((0, 2))], [np.zeros((0, na))]
-    for x in runs:
-        if x.timing is not None and x.tau is not None:
-            timing.append(x.timing.T)
-            tau.append(x.tau)
+    splines = [x.spline for x in runs]
     sizes = [
-        (len(x.spline.nodes), x.n if x.timing is not None else 0, x.lead, x.rest)
+        (len(x.spline.nodes), len(x.spline.grid), x.timing.shape[1], x.lead, x.rest)
         for x in runs
     ]
     return {
         "run_sizes": np.array(sizes),
-        "run_cruise": np.array([x.cruise for x in splines]),
+        "run_ends": np.stack([x.ends for x in splines]),
         "node_s": np.concatenate([x.nodes for x in splines]),
         "node_qpos": np.concatenate([x.postures for x in splines]),
-        "node_tau": np.concatenate([x.held for x in splines]),
-        "timed_s": np.concatenate(timing),
-        "timed_tau": np.concatenate(tau),
+        "grid_s": np.concatenate([x.grid for x in splines]),
+        "grid_tau": np.concatenate([x.tau for x in splines]),
+        "timed_s": np.concatenate([x.timing.T for x in runs]),
     }
 
 
 def runs_of_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[Run, ...]:
     """The runs that `runs_as_arrays` took apart."""
-    sizes, out, node, row = arrays["run_sizes"].astype(int), [], 0, 0
-    for (nodes, samples, lead, rest), cruise in zip(
-        sizes.tolist(), arrays["run_cruise"].tolist(), strict=True
+    sizes = arrays["run_sizes"].astype(int)
+    stops = np.cumsum(sizes[:, :3], axis=0)
+    out = []
+    for (*_, lead, rest), stop, start, ends in zip(
+        sizes.tolist(), stops, stops - sizes[:, :3], arrays["run_ends"], strict=True
     ):
-        mine = slice(node, node + nodes)
-        s, q, torques = arrays["node_s"], arrays["node_qpos"], arrays["node_tau"]
-        spline = spline_through(s[mine], q[mine], torques[mine], cruise)
-        timing = tau = None
-        n = samples
-        if samples:
-            timing = np.ascontiguousarray(arrays["timed_s"][row : row + samples].T)
-            tau = arrays["timed_tau"][row : row + samples]
-        else:
-            n = profile_samples(spline.length, cruise)
-        out.append(Run(spline, n, timing, tau, lead, rest))
-        node, row = node + nodes, row + samples
+        node, point, row = (slice(a, b) for a, b in zip(start, stop, strict=True))
+        spline = spline_through(
+            arrays["node_s"][node],
+            arrays["node_qpos"][node],
+            ends,
+            arrays["grid_s"][point],
+            arrays["grid_tau"][point],
+        )
+        timing = np.ascontiguousarray(arrays["timed_s"][row].T)
+        out.append(Run(spline, timing, lead, rest))
     return tuple(out)

@@ -1,12 +1,12 @@
-"""Path -> the fastest time law along it that joints and contacts can bear.
+"""Path -> the fastest time law along all of it that joints and contacts can bear.
 
 With q(s) given, joint torques and contact forces are linear in u = d2s/dt2 and
-x = (ds/dt)^2. What (u, x) some forces within the friction cones and some torques within
-the effort limits can produce is therefore a convex polygon at each point of the path.
-Polygons are found by small QPs from inside, shrunk towards rest, and handed to
-`toppra`, which finds the fastest law from rest to rest within all of them.
+x = (ds/dt)^2 [Bobrow85]. At each point of the path some forces within the friction
+cones and some torques within the limits must produce (u, x): how fast each point may be
+left is found from the end backwards, then the law from the start, by a small LP each
+with the forces as variables [Hauser14, Pham18]. Only the two ends are at rest.
 
-Shapes: n points of the path, nc contact points, nv velocities, na actuated joints.
+Shapes: n points of the path, nv velocities.
 """
 
 from __future__ import annotations
@@ -14,257 +14,130 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
-import daqp
 import mujoco
 import numpy as np
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.step.polygon import support_polygon
-from clamber.step.stability import EFFORT_SHARE, statics_at
-from clamber.step.statics import cone_generators
+from clamber.step.tasks import packed_contacts
 
-JOINT_SPEED = 4.0  # [rad/s] of a joint whose description has no lower limit
-# [rad/s^2] of a joint: what servos of 600 N m/rad and 50 N m follow within 0.02 rad on
-# links of half a kg m^2.
-JOINT_ACCELERATION = 25.0
+Speed = float | Literal["max"]
+
+JOINT_SPEED = 4.0  # [rad/s] that `max` stands for
+# [1/s] a joint's acceleration against its speed limit: at 4 rad/s what servos of
+# 600 N m/rad and 50 N m follow within 0.02 rad on links of half a kg m^2.
+QUICKNESS = 6.0
+BASE_LENGTH = 0.3  # [m] of base translation count as one radian
 INERTIA_SHARE = 0.6  # of what is left between rest and the border of what can be borne
-SLOW = 0.3  # [rad/s] where the limits leave nothing: as slow as this, as smooth
+SLOW = 0.3  # [rad/s] where not even rest is within the limits
 TOUCH_SPEED = 0.08  # [m/s] along the normal, near a contact to be made
 TOUCH_ZONE = 0.012  # [m] what is near
 SMOOTHING = 0.06  # [s] width of the kernel that rounds the acceleration's corners
-GRID = 32  # points of a path
 STEP = 0.001  # [s]
-_RANK = 1e-4  # of a regularisation against a direction of length one
-_SLACK = 1e8  # of an unbalanced force against a contact force, squared
-# Directions in (u, x), each in units of its bound, in which polygons are explored.
-_DIRECTIONS = [
-    (math.sin(a), math.cos(a)) for a in np.linspace(-0.5 * np.pi, 0.5 * np.pi, 7)
-]
+_FLAT = 1e-3  # a path is no flatter than this: where nothing moves, nothing is limited
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Demand:
-    """Generalised forces at one point of a path, `rest + inertia u + velocity x`.
+class Course:
+    """Points of a path.
 
     Attributes:
-        rest, inertia, velocity: (nv,).
-        jacobian: (3 nc, nv) of the contact points.
-        cones: (nc, m, 3) edges of the friction pyramids (inside the cones).
+        s: (n,) increasing; the first and the last are at rest.
+        q: (n, nq).
+        slope: (n, nv) dq/ds on the manifold.
+        bend: (n, nv) its derivative, d2q/ds2.
+        stance: (n,) of `stances`, which contacts may bear.
+        stances: By number.
+        makes: (n,) of `made`, the contact to be made soon, gently; -1 for none.
+        made: By number.
     """
 
-    rest: np.ndarray
-    inertia: np.ndarray
-    velocity: np.ndarray
-    jacobian: np.ndarray
-    cones: np.ndarray
+    s: np.ndarray
+    q: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    stance: np.ndarray
+    stances: Sequence[Sequence[Contact]]
+    makes: np.ndarray
+    made: Sequence[Contact]
 
     __repr__ = short_repr
 
 
-def demand_at(
-    kin: Kinematics,
-    q: np.ndarray,
-    slope: np.ndarray,
-    bend: np.ndarray,
-    contacts: Sequence[Contact],
-) -> Demand:
-    """What a point of the path asks for.
-
-    Args:
-        kin: Workspace.
-        q: (nq,).
-        slope: (nv,) dq/ds on the manifold.
-        bend: (nv,) its derivative, d2q/ds2.
-        contacts: Those that may bear.
-    """
+def inertia_along(kin: Kinematics, course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """(n, nv) generalised forces for each unit of u, and of x, besides gravity's."""
     m, d = kin.world.model, kin.data
-    kin.update(q)
-    mujoco.mj_makeM(m, d)
-    inertia, bent = np.zeros(m.nv), np.zeros(m.nv)
-    mujoco.mj_mulM(m, d, inertia, slope)
-    mujoco.mj_mulM(m, d, bent, bend)
-    bias = []
-    for v in (np.zeros(m.nv), slope):
-        d.qvel[:] = v
-        mujoco.mj_comVel(m, d)
-        out = np.zeros(m.nv)
-        mujoco.mj_rne(m, d, 0, out)
-        bias.append(out)
+    of_u, of_x = np.empty_like(course.slope), np.empty_like(course.slope)
+    bent, still, moving = np.zeros((3, m.nv))
+    for i, q in enumerate(course.q):
+        kin.update(q)
+        mujoco.mj_makeM(m, d)
+        mujoco.mj_mulM(m, d, of_u[i], course.slope[i])
+        mujoco.mj_mulM(m, d, bent, course.bend[i])
+        for v, out in (0.0, still), (course.slope[i], moving):
+            d.qvel[:] = v
+            mujoco.mj_comVel(m, d)
+            mujoco.mj_rne(m, d, 0, out)
+        of_x[i] = bent + moving - still
     d.qvel[:] = 0.0
-    points, _, torque = statics_at(kin, q, contacts)
-    return Demand(
-        rest=bias[0],
-        inertia=inertia,
-        velocity=bent + bias[1] - bias[0],
-        jacobian=torque.jacobian,
-        cones=cone_generators(points.normals, points.mu, 4),
-    )
-
-
-def _loads(demand: Demand, weight: float) -> np.ndarray:
-    """(nv, 4 nc) generalised force of one weight along each edge of the pyramids."""
-    nc, m, _ = demand.cones.shape
-    J = demand.jacobian.reshape(nc, 3, -1)
-    return weight * np.einsum("ikv,imk->vim", J, demand.cones).reshape(-1, nc * m)
-
-
-def bearable(
-    kin: Kinematics,
-    demand: Demand,
-    slope: np.ndarray,
-    u_max: float,
-    x_max: float,
-) -> np.ndarray | None:
-    """(K, 2) corners of a polygon of (u, x) that can be borne, rest among them.
-
-    From inside: each corner is found with its contact forces. None where not even rest
-    is within the limits.
-
-    Args:
-        kin: Workspace.
-        demand: At this point.
-        slope: (nv,) dq/ds, for the joints' viscous damping.
-        u_max: Bound of |u|.
-        x_max: Bound of x.
-    """
-    w = kin.world
-    weight = w.mass * 9.81
-    E = _loads(demand, weight)
-    nf = E.shape[1]
-    B = np.column_stack([demand.inertia * u_max, demand.velocity * x_max])
-    # Damping grows with the root of x: its tangent at a quarter is above it everywhere.
-    friction = w.model.dof_damping * slope * math.sqrt(x_max)
-    B[:, 1] += friction
-    rest = demand.rest + 0.25 * friction
-    A = np.concatenate([B, -E], axis=1)  # A (u, x, shares) + rest = (0, tau)
-    limits = EFFORT_SHARE * w.tau_max
-    scale = np.concatenate([np.full(6, weight), np.ones(len(limits))])
-    rows = np.concatenate([A[:6], A[w.dadr]]) / scale[:, None]
-    lower = np.concatenate([-rest[:6], -limits - rest[w.dadr]]) / scale
-    upper = np.concatenate([-rest[:6], limits - rest[w.dadr]]) / scale
-    sense = np.zeros(2 + nf + len(rows), dtype=np.intc)
-    sense[2 + nf : 2 + nf + 6] = 5
-    lower = np.concatenate([[-1.0, 0.0], np.zeros(nf), lower])
-    upper = np.concatenate([[1.0, 1.0], np.full(nf, 1e30), upper])
-    H = np.diag(np.full(2 + nf, _RANK))
-    corners = []
-    still = upper.copy(), lower.copy()
-    still[0][:2] = still[1][:2] = 0.0
-    starting = upper.copy(), lower.copy()
-    starting[0][1] = 0.0
-    for bounds, direction in (
-        (still, (0.0, 0.0)),
-        (starting, (-1.0, 0.0)),
-        (starting, (1.0, 0.0)),
-        *(((upper, lower), d) for d in _DIRECTIONS),
-    ):
-        f = np.zeros(2 + nf)
-        f[:2] = -np.asarray(direction)
-        z, _, flag, _ = daqp.solve(H, f, rows, *bounds, sense.copy())
-        if flag == 1:
-            corners.append(z[:2] * [u_max, x_max])
-        elif not corners:
-            return None
-    return np.array(corners)
-
-
-def least_torques(
-    kin: Kinematics,
-    demand: Demand,
-    u: float,
-    x: float,
-    price: np.ndarray | None = None,
-) -> np.ndarray:
-    """(na,) joint torques for (u, x) with the least contact forces in the cones.
-
-    Viscous damping of the joints is left to the controller. `price` (nc,) is that of
-    the force at each point; None: 1 each.
-    """
-    w = kin.world
-    weight = w.mass * 9.81
-    total = demand.rest + u * demand.inertia + x * demand.velocity
-    E = _loads(demand, weight)
-    edges = demand.cones.reshape(-1, 3)
-    nc, m, _ = demand.cones.shape
-    normal = np.repeat(demand.cones.mean(axis=1), m, axis=0)
-    along = np.sum(edges * normal, axis=1)
-    # Tangential forces count four times, as in `contact_forces`.
-    metric = 4.0 * edges @ edges.T - 3.0 * np.outer(along, along) * (normal @ normal.T)
-    prices = np.eye(nc) if price is None else np.diag(price)
-    H = np.kron(prices, np.ones((m, m))) * metric + 1e-6 * np.eye(nc * m)
-    H = H + _SLACK * (E[:6].T @ E[:6]) / weight**2
-    f = -_SLACK * (E[:6].T @ total[:6]) / weight**2
-    n = nc * m
-    scale = 1.0 / math.sqrt(_SLACK)
-    z, _, flag, _ = daqp.solve(
-        H * scale, f * scale, np.zeros((0, n)), np.full(n, 1e30), np.zeros(n)
-    )
-    load = E @ z if flag == 1 else np.zeros(len(total))
-    return np.clip((total - load)[w.dadr], -w.tau_max, w.tau_max)
+    return of_u, of_x
 
 
 def fastest(
-    s: np.ndarray, polygons: Sequence[np.ndarray], x_max: np.ndarray
+    kin: Kinematics,
+    course: Course,
+    inertia: tuple[np.ndarray, np.ndarray],
+    speed: Speed,
 ) -> np.ndarray:
     """(n,) squared rate (ds/dt)^2 of the fastest law from rest to rest.
 
     Args:
-        s: (n,) grid, increasing.
-        polygons: n of (K, 2) corners of what (u, x) may be, rest among them.
-        x_max: (n,) bound of x.
-
-    Raises:
-        ValueError: There is none.
+        kin: Workspace.
+        course: The path.
+        inertia: Along it, see `inertia_along`.
+        speed: Of the fastest joint [rad/s].
     """
-    # Brings matplotlib with it: not before it is needed.
-    from toppra import SplineInterpolator
-    from toppra.algorithm import TOPPRA
-    from toppra.constraint import LinearConstraint
-
-    n = len(s)
-    halves = [_half_planes(p) for p in polygons]
-    k = max(len(h) for h in halves)
-    F, g = np.zeros((n, k, 2)), np.ones((n, k))
-    for i, h in enumerate(halves):
-        F[i, : len(h)], g[i, : len(h)] = h[:, :2], h[:, 2]
-
-    class _Polygons(LinearConstraint):
-        def compute_constraint_params(
-            self, path: object, gridpoints: np.ndarray, *args: object, **kwargs: object
-        ) -> tuple[np.ndarray | None, ...]:
-            a, b = np.tile([1.0, 0.0], (n, 1)), np.tile([0.0, 1.0], (n, 1))
-            bound = np.column_stack([np.zeros(n), x_max])
-            return a, b, np.zeros((n, 2)), F, g, None, bound
-
-    path = SplineInterpolator(s, s[:, None])
-    solver = TOPPRA([_Polygons()], path, gridpoints=s, solver_wrapper="seidel")
-    rate = solver.compute_parameterization(0.0, 0.0)[1]
-    if rate is None or np.isnan(rate).any():
-        raise ValueError("no time law along the path")
-    return rate**2
+    w = kin.world
+    v = JOINT_SPEED if speed == "max" else speed
+    scaled = np.abs(course.slope)
+    scaled[:, :3] /= BASE_LENGTH
+    steep = np.maximum(scaled.max(axis=1), _FLAT)
+    bent = np.abs(course.bend)
+    bent[:, :3] /= BASE_LENGTH
+    bend = np.maximum(bent.max(axis=1), _FLAT)
+    x_max = np.minimum((v / steep) ** 2, QUICKNESS * v / bend)
+    for i in np.flatnonzero(course.makes >= 0):
+        x_max[i] = min(x_max[i], _gentle(kin, course, i))
+    crawl = (min(v, SLOW) / steep) ** 2
+    return kin.core.time_law(
+        [packed_contacts(w, c) for c in course.stances],
+        course.stance.astype(np.int32),
+        course.q,
+        course.slope,
+        *inertia,
+        np.stack([course.s, QUICKNESS * v / steep, x_max, crawl]),
+        w.model.dof_damping,
+        INERTIA_SHARE,
+    )
 
 
-def _half_planes(corners: np.ndarray) -> np.ndarray:
-    """(k, 3) rows (a, b, g) of a u + b x <= g, x >= 0 left out, rows of length one."""
-    size = np.maximum(np.abs(corners).max(axis=0), 1e-9)
-    hull = support_polygon(corners / size)
-    if len(hull) < 3:
-        return np.array([[1.0, 0.0, 1e-6], [-1.0, 0.0, 1e-6], [0.0, 1.0, 1e-6]])
-    edge = np.roll(hull, -1, axis=0) - hull
-    normal = np.column_stack([edge[:, 1], -edge[:, 0]])
-    middle = hull.mean(axis=0)
-    normal *= np.sign(np.sum((hull - middle) * normal, axis=1))[:, None]
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    g = np.sum(normal * hull, axis=1) + 1e-6
-    keep = normal[:, 1] > -1.0 + 1e-9
-    return np.column_stack([normal / size, g])[keep]
+def _gentle(kin: Kinematics, course: Course, i: int) -> float:
+    """Bound of x at a point near a contact to be made, infinite where it is not near."""
+    c = course.made[course.makes[i]]
+    n = kin.world.supports[c.support].normal
+    kin.update(course.q[i])
+    p = kin.contact_point(c.surface, n, c.edge)
+    if (p - c.position) @ n >= TOUCH_ZONE:
+        return math.inf
+    J = kin.point_jacobian(kin.world.surfaces[c.surface].body, p)
+    return (TOUCH_SPEED / max(abs(float(n @ J @ course.slope[i])), 1e-9)) ** 2
 
 
-def sample_law(s: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Path s and ds/dt at each millisecond after the start, made smooth.
+def sample_law(s: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(2, m) path s and ds/dt at each millisecond after the start, made smooth.
 
     Between grid points the acceleration is constant. The law is averaged over a window
     of time, so that its acceleration has no steps; the rate stays its derivative.
@@ -283,54 +156,7 @@ def sample_law(s: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     t = STEP * (np.arange(1 - m, n) + 1.0)
     i = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(dt) - 1)
     tau = np.clip(t, 0.0, knots[-1]) - knots[i]
-    u = np.diff(rate) / dt
+    u = np.diff(rate) / np.maximum(dt, 1e-12)
     raw = s[i] + tau * (rate[i] + 0.5 * u[i] * tau)
     fast = np.where((t <= 0) | (t >= knots[-1]), 0.0, rate[i] + u[i] * tau)
-    return np.convolve(raw, kernel, "valid"), np.convolve(fast, kernel, "valid")
-
-
-def retime(
-    kin: Kinematics,
-    s: np.ndarray,
-    q: np.ndarray,
-    slope: np.ndarray,
-    bend: np.ndarray,
-    contacts: Sequence[Contact],
-    touch: Contact | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The fastest motion from rest to rest: s and ds/dt at each millisecond.
-
-    Args:
-        kin: Workspace.
-        s: (n,) grid.
-        q: (n, nq).
-        slope: (n, nv) dq/ds on the manifold.
-        bend: (n, nv) its derivative, d2q/ds2.
-        contacts: Those that may bear all the way.
-        touch: The contact to be made at the end: gently.
-    """
-    w = kin.world
-    polygons, x_max = [], np.empty(len(s))
-    for i in range(len(s)):
-        steep = np.maximum(np.abs(slope[i, w.dadr]), 1e-9)
-        x = float((JOINT_SPEED / steep).min()) ** 2
-        kin.update(q[i])
-        if touch is not None:
-            n = w.supports[touch.support].normal
-            p = kin.contact_point(touch.surface, n, touch.edge)
-            if (p - touch.position) @ n < TOUCH_ZONE and s[i] > 0.5 * s[-1]:
-                J = kin.point_jacobian(w.surfaces[touch.surface].body, p)
-                x = min(x, (TOUCH_SPEED / max(abs(float(n @ J @ slope[i])), 1e-9)) ** 2)
-        u = JOINT_ACCELERATION / float(steep.max())
-        x = min(x, JOINT_ACCELERATION / max(float(np.abs(bend[i]).max()), 1e-9))
-        corners = bearable(
-            kin, demand_at(kin, q[i], slope[i], bend[i], contacts), slope[i], u, x
-        )
-        if corners is not None:
-            corners = INERTIA_SHARE * corners
-        if corners is None or len(support_polygon(corners / [u, x])) < 3:
-            crawl = (SLOW / float(steep.max())) ** 2
-            corners = np.array([[0, 0], [-crawl, 0], [crawl, 0], [0, crawl]])
-        polygons.append(corners)
-        x_max[i] = x
-    return sample_law(s, fastest(s, polygons, x_max))
+    return np.stack([np.convolve(x, kernel, "valid") for x in (raw, fast)])

@@ -1,20 +1,20 @@
 """Paths -> one timed trajectory, 1 kHz, velocity the exact derivative.
 
-Each phase is a cubic spline through its postures, at rest at both ends, parametrised by
-the largest joint angle travelled; time runs along it under a velocity profile that
-accelerates, cruises at the speed limit and brakes (`samples`). The base's rotation is
-the normalised spline of its quaternion, so that the angular velocity is its derivative
-on the manifold.
+All phases together are one path: cubic splines through their postures, that join with
+one tangent, along which no contact moves that is closed before or after. It is
+parametrised by the largest joint angle travelled, and time runs along all of it at once
+(`timing`): the robot rests at the start and at the end, and nowhere else. The base's
+rotation is the normalised spline of its quaternion, so that the angular velocity is its
+derivative on the manifold.
 
-Feed-forward torques balance gravity with the contact forces of least norm at every
-posture, those of leaving contacts ever dearer, and are interpolated along the spline.
+Feed-forward torques balance gravity and inertia with the contact forces of least norm,
+those of leaving contacts ever dearer, and are interpolated along the spline.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -25,36 +25,32 @@ from clamber.model.records import short_repr
 from clamber.model.se3 import quat_conjugate, quat_multiply
 from clamber.model.world import World
 from clamber.planning.samples import (
-    ACCELERATION,
     RATE,
     Run,
     Samples,
     Spline,
-    profile,
-    profile_samples,
     sampled,
     spline_through,
 )
-from clamber.planning.timing import GRID, demand_at, least_torques, retime
+from clamber.planning.timing import (
+    BASE_LENGTH,
+    Course,
+    Speed,
+    fastest,
+    inertia_along,
+    sample_law,
+)
 from clamber.step.change import Change
 from clamber.step.path import Phase
-from clamber.step.polygon import com_margins, support_polygon
-from clamber.step.stability import contact_points
-from clamber.step.statics import GRAVITY
-from clamber.step.tasks import packed_contacts
+from clamber.step.tasks import contact_rows, packed_contacts
 
-REST = 0.10  # [s] at rest between two phases
-TOUCH_REST, MIN_REST = 0.08, 0.02  # [s] ... of a fast motion: after a touch, elsewhere
 HOLD_START = 0.3  # [s]
 HOLD_END = 2.0  # [s] the last posture is held
-BASE_LENGTH = 0.3  # [m] of base translation count as one radian
-INERTIA_SHARE = 0.6  # of the balance margin that inertia may use up
-BALANCE_SAMPLES = 24  # of the centre of mass along a phase
-BALANCE_STRIDE = 20  # samples of the profile between two looks at the balance
-SLOWING, MAX_SLOWINGS = 0.85, 16  # factor of one reduction of speed, and how many
 LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
-TORQUE_STRIDE = 20  # samples of a fast motion between two looks at its torques
-SAMPLES = 24  # per gap between two postures, to find the largest speed
+GRID_STEP = 0.06  # [rad] between two points of a path, at most; at least 5 of a phase
+GRID_MOST = 24  # points of a phase
+EDGE = 1e-7  # [rad] behind a joint of two phases, where their second derivatives differ
+STEEPER = 2.0  # times the slower side: a tangent there, or the spline swings over
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -119,14 +115,6 @@ class Trajectory:
         return int(np.clip(round(t * RATE), 0, len(self.time) - 1))
 
 
-def phase_torques(kin: Kinematics, phase: Phase) -> np.ndarray:
-    """(n, na) torques that hold each posture of a phase, load handed over along it."""
-    share = _arclength(kin, phase.q)
-    share = share / share[-1] if share[-1] > 0 else share
-    contacts, prices = handed_over(phase, share)
-    return holding_torques(kin, phase.q, contacts, prices)
-
-
 def handed_over(
     phase: Phase, share: np.ndarray
 ) -> tuple[tuple[Contact, ...], np.ndarray]:
@@ -153,6 +141,7 @@ def holding_torques(
     q: np.ndarray,
     contacts: Sequence[Contact],
     prices: np.ndarray | None = None,
+    inertia: np.ndarray | None = None,
 ) -> np.ndarray:
     """(n, na) joint torques that balance gravity with the least contact forces.
 
@@ -164,10 +153,14 @@ def holding_torques(
         q: (n, nq).
         contacts: k that may bear.
         prices: (n, k) of the force of each, 0 where it does not bear; None: 1 each.
+        inertia: (n, nv) generalised forces besides gravity's; None: at rest.
     """
     if prices is None:
         prices = np.ones((len(q), len(contacts)))
-    return kin.core.holding_torques(*packed_contacts(kin.world, contacts), prices, q)
+    if inertia is None:
+        inertia = np.zeros((0, 0))
+    packed = packed_contacts(kin.world, contacts)
+    return kin.core.holding_torques(*packed, prices, q, inertia)
 
 
 def holding_torque(
@@ -177,97 +170,86 @@ def holding_torque(
     return holding_torques(kin, q[None], contacts)[0]
 
 
-def point_prices(
-    kin: Kinematics, contacts: Sequence[Contact], price: np.ndarray
-) -> np.ndarray:
-    """(nc,) the price of each bearing point, from those of the contacts (n,)."""
-    up = [kin.world.supports[c.support].normal for c in contacts]
-    count = [
-        len(kin.bearing_points(c.surface, n, c.edge))
-        for c, n in zip(contacts, up, strict=True)
+def _path(
+    kin: Kinematics, phases: Sequence[Phase]
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each phase its path parameters (n,), postures (n, nq) and end slopes (2, nq).
+
+    Raises:
+        ValueError: Two phases do not join.
+    """
+    postures: list[np.ndarray] = []
+    for i, phase in enumerate(phases):
+        last = postures[-1][-1] if i else phase.q[0]
+        if np.abs(kin.difference(last, phase.q[0])).max() > 1e-9:
+            raise ValueError(
+                f"phase {i} ({phase.kind}) does not begin where the last one ended"
+            )
+        rows = np.concatenate([last[None], phase.q])  # quaternions of one sign
+        turns = np.sum(rows[1:, 3:7] * rows[:-1, 3:7], axis=1) < 0
+        rows[1:][np.cumsum(turns) % 2 == 1, 3:7] *= -1
+        postures.append(rows[1:])
+    parameters = [_arclength(kin, q) for q in postures]
+    slopes = np.zeros((len(phases) + 1, 2, phases[0].q.shape[1]))
+    for i in range(1, len(phases)):
+        before, after = postures[i - 1], postures[i]
+        tangent = _tangent(
+            kin,
+            before[-2:],
+            after[:2],
+            (parameters[i - 1][-1] - parameters[i - 1][-2], parameters[i][1]),
+            {c.surface: c for p in phases[i - 1 : i + 1] for c in p.contacts},
+        )
+        for side, q in enumerate((before[-1], after[0])):
+            slopes[i, side] = _raw(q, tangent)
+    return [
+        (s, q, np.stack([slopes[i, 1], slopes[i + 1, 0]]))
+        for i, (s, q) in enumerate(zip(parameters, postures, strict=True))
     ]
-    return np.repeat(price, count)
+
+
+def _tangent(
+    kin: Kinematics,
+    before: np.ndarray,
+    after: np.ndarray,
+    steps: tuple[float, float],
+    closed: dict[str, Contact],
+) -> np.ndarray:
+    """(nv,) where two phases join: none of the closed contacts moves.
+
+    Args:
+        kin: Workspace.
+        before, after: (2, nq) the last postures of the one, the first of the other.
+        steps: Of the path parameter between them.
+        closed: By surface.
+    """
+    a, b = (
+        kin.difference(*q) / h for q, h in zip((before, after), steps, strict=True)
+    )
+    ha, hb = steps
+    mean = (hb * a + ha * b) / (ha + hb)
+    most = STEEPER * np.minimum(np.abs(a), np.abs(b)) * (a * b > 0)
+    kin.update(after[0])
+    A = contact_rows(kin, closed.values())
+    return _along(A, np.clip(mean, -most, most))
+
+
+def _along(A: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """What is nearest to `v` (n,) of all that A (m, n) takes to zero."""
+    return v - np.linalg.pinv(A, rcond=1e-8) @ (A @ v)
+
+
+def _raw(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(nq,) derivative of raw coordinates that goes with a tangent vector (nv,)."""
+    turn = quat_multiply(q[3:7], np.array([0.0, *v[3:6]]))
+    return np.concatenate([v[:3], 0.5 * turn, v[6:]])
 
 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
     """(n,) path parameter: the largest joint angle travelled, base included, scaled."""
     ways = np.abs(kin.core.differences(nodes))
     ways[:, :3] /= BASE_LENGTH
-    return np.cumsum([0.0, *np.maximum(ways.max(axis=1), 1e-6)])
-
-
-def _spline(kin: Kinematics, phase: Phase, speed: float) -> Spline:
-    nodes = phase.q.copy()
-    for k in range(1, len(nodes)):
-        if nodes[k, 3:7] @ nodes[k - 1, 3:7] < 0:
-            nodes[k, 3:7] *= -1
-    s = _arclength(kin, nodes)
-    spline = spline_through(s, nodes, phase_torques(kin, phase), np.inf)
-    _, slope = spline.along(np.linspace(0.0, s[-1], SAMPLES * len(nodes)))
-    slope = np.abs(slope)
-    slope[:, :3] /= BASE_LENGTH
-    cruise = float((speed / np.maximum(slope.max(axis=0), 1e-9)).min())
-    if np.isfinite(cruise):
-        cruise = _balanced_cruise(kin, phase, spline, cruise)
-    return replace(spline, cruise=cruise)
-
-
-def zero_moment_point(
-    com: np.ndarray, acceleration: np.ndarray, z: float
-) -> np.ndarray:
-    """(n, 2) where the ground force acts if all mass were at the centre of mass.
-
-    p = c - (c_z - z) / (g + a_z) a, over the horizontal: what the inertia of a fast
-    motion adds to the projection of the centre of mass [Vukobratovic04].
-
-    Args:
-        com: (n, 3) [m].
-        acceleration: (n, 3) of the centre of mass [m/s^2].
-        z: Height of the contacts [m].
-    """
-    lever = (com[:, 2] - z) / (GRAVITY + acceleration[:, 2])
-    return com[:, :2] - lever[:, None] * acceleration[:, :2]
-
-
-def _balanced_cruise(
-    kin: Kinematics, phase: Phase, spline: Spline, cruise: float
-) -> float:
-    """The cruise speed, reduced until inertia leaves the robot its balance.
-
-    The zero-moment point may use up `INERTIA_SHARE` of the distance that the centre of
-    mass has to the border of the support polygon.
-    """
-    length = spline.length
-    fine = np.linspace(0.0, length, BALANCE_SAMPLES)
-    q, _ = spline.along(fine)
-    com = kin.core.centres_of_mass(q)
-    kin.update(q[-1])
-    points = contact_points(kin, phase.contacts).points
-    polygon = support_polygon(points[:, :2])
-    low = float(points[:, 2].min())
-    room = np.maximum(com_margins(com[:, :2], polygon), 0.0)
-    # Most motion is so slow that inertia could not use up its share however it went:
-    # three times what the samples say, and the steepest rise of the speed.
-    speed, bend = (np.diff(com, k, axis=0) / fine[1] ** k for k in (1, 2))
-    steepest = 0.35 * np.pi * ACCELERATION * cruise
-    most = 3.0 * float(
-        np.linalg.norm(bend, axis=1).max() * cruise**2
-        + np.linalg.norm(speed, axis=1).max() * steepest
-    )
-    high = float(com[:, 2].max()) - low
-    if high * most <= INERTIA_SHARE * float(room.min()) * (GRAVITY - most):
-        return cruise
-    path = CubicSpline(fine, com)
-    for _ in range(MAX_SLOWINGS):
-        s, rate = profile(length, cruise, BALANCE_STRIDE)
-        change = np.gradient(rate, BALANCE_STRIDE / RATE)
-        acceleration = path(s, 2) * rate[:, None] ** 2 + path(s, 1) * change[:, None]
-        p = zero_moment_point(path(s), acceleration, low)
-        margin = com_margins(p, polygon)
-        if np.all(margin >= (1.0 - INERTIA_SHARE) * np.interp(s, fine, room)):
-            break
-        cruise *= SLOWING
-    return cruise
+    return np.cumsum([0.0, *np.maximum(ways.max(axis=1), 1e-4)])
 
 
 def _made(phases: Sequence[Phase], i: int) -> Contact | None:
@@ -277,32 +259,6 @@ def _made(phases: Sequence[Phase], i: int) -> Contact | None:
     before = {(c.surface, c.support) for c in phases[i].contacts}
     after = phases[i + 1].contacts
     return next((c for c in after if (c.surface, c.support) not in before), None)
-
-
-def _fastest(
-    kin: Kinematics, phase: Phase, spline: Spline, made: Contact | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """s, ds/dt (n,) and torques (n, na) of the fastest motion along a phase."""
-    grid = np.linspace(0.0, spline.length, GRID)
-    q, slope = spline.along(grid)
-    s, rate = retime(
-        kin, grid, q, slope, _bend(spline.curve, grid), phase.contacts, made
-    )
-    change = np.gradient(rate, 1.0 / RATE) if len(rate) > 1 else np.zeros(1)
-    look = np.unique([*range(0, len(s), TORQUE_STRIDE), len(s) - 1])
-    q, slope = spline.along(s[look])
-    bend = _bend(spline.curve, s[look])
-    tau = []
-    every, price_of = handed_over(phase, s[look] / spline.length)
-    for i, k in enumerate(look):
-        bears = np.flatnonzero(price_of[i])
-        contacts = tuple(every[j] for j in bears)
-        demand = demand_at(kin, q[i], slope[i], bend[i], contacts)
-        prices = point_prices(kin, contacts, price_of[i, bears])
-        squared = float(rate[k] ** 2)
-        tau.append(least_torques(kin, demand, float(change[k]), squared, prices))
-    between = [np.interp(np.arange(len(s)), look, x) for x in np.transpose(tau)]
-    return s, rate, np.stack(between, axis=1)
 
 
 def _bend(curve: CubicSpline, s: np.ndarray) -> np.ndarray:
@@ -320,10 +276,10 @@ def build_trajectory(
     world: World,
     phases: Sequence[Phase],
     *,
-    speed: float | Literal["max"],
+    speed: Speed,
     keyframe_after: Sequence[int] = (0,),
 ) -> Trajectory:
-    """Time the phases one after the other.
+    """Time the phases, all of them together.
 
     Args:
         world: Robot and scene.
@@ -336,7 +292,7 @@ def build_trajectory(
     """
     kin = Kinematics(world)
     surfaces = tuple(world.surfaces)
-    runs = [_run(kin, phases, i, speed) for i in range(len(phases))]
+    runs = _runs(kin, phases, speed)
     lengths = [x.samples for x in runs]
     stops, n = np.cumsum(lengths), sum(lengths)
     closed = [{c.surface for c in phase.contacts} for phase in phases]
@@ -353,10 +309,62 @@ def build_trajectory(
     )
 
 
+def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
+    """The phases in time."""
+    path = _path(kin, phases)
+    starts = np.cumsum([0.0, *(s[-1] for s, _, _ in path)])
+    grids, looked, makes = [], [], []
+    made = [_made(phases, i) for i in range(len(phases))]
+    for i, (s, postures, ends) in enumerate(path):
+        count = int(np.clip(np.ceil(s[-1] / GRID_STEP), 5, GRID_MOST))
+        grid = np.linspace(0.0, s[-1], count)
+        grid[0] = EDGE if i else 0.0
+        spline = spline_through(s, postures, ends, grid, np.zeros((0, 0)))
+        grids.append(grid)
+        looked.append((*spline.along(grid), _bend(spline.curve, grid)))
+        soon = (made[i] is not None) & (grid > 0.5 * s[-1])
+        makes.append(np.where(soon, i, -1))
+    q, slope, bend = (np.concatenate(x) for x in zip(*looked, strict=True))
+    course = Course(
+        s=np.concatenate([a + g for a, g in zip(starts, grids, strict=False)]),
+        q=q,
+        slope=slope,
+        bend=bend,
+        stance=np.repeat(np.arange(len(phases)), [len(g) for g in grids]),
+        stances=[p.contacts for p in phases],
+        makes=np.concatenate(makes),
+        made=made,
+    )
+    inertia = of_u, of_x = inertia_along(kin, course)
+    x = fastest(kin, course, inertia, speed)
+    u = np.append(np.diff(x) / (2.0 * np.diff(course.s)), 0.0)
+    forces = u[:, None] * of_u + x[:, None] * of_x
+    law = sample_law(course.s, x)
+    # A phase has at least one sample, however short it is.
+    each = np.arange(len(phases) - 1)
+    cuts = np.searchsorted(law[0], starts[1:-1], side="right") - each
+    timings = np.split(law, np.maximum.accumulate(np.maximum(cuts, 1)) + each, axis=1)
+    out, row = [], 0
+    for i, (phase, (s, postures, ends), grid) in enumerate(
+        zip(phases, path, grids, strict=True)
+    ):
+        rows = slice(row, row + len(grid))
+        row += len(grid)
+        contacts, prices = handed_over(phase, grid / grid[-1])
+        tau = holding_torques(kin, q[rows], contacts, prices, forces[rows])
+        spline = spline_through(s, postures, ends, grid, tau)
+        timing = timings[i].copy()
+        timing[0] -= starts[i]
+        lead = 0 if i else round(HOLD_START * RATE)
+        rest = round(HOLD_END * RATE) if i == len(phases) - 1 else 0
+        out.append(Run(spline, timing, lead, rest))
+    return out
+
+
 def timed(
     world: World,
     changes: Sequence[Change],
-    speed: float | Literal["max"],
+    speed: Speed,
     lead: Sequence[Phase] = (),
 ) -> Trajectory | None:
     """The trajectory of `lead`, which leads to the first keyframe, and the changes.
@@ -397,30 +405,3 @@ def _segments(
         )
     out.append(Segment(kind="hold", change=None, begin=still, end=stops[-1]))
     return tuple(out)
-
-
-def _run(
-    kin: Kinematics,
-    phases: Sequence[Phase],
-    i: int,
-    speed: float | Literal["max"],
-) -> Run:
-    phase = phases[i]
-    if i and np.abs(kin.difference(phases[i - 1].q[-1], phase.q[0])).max() > 1e-9:
-        raise ValueError(
-            f"phase {i} ({phase.kind}) does not begin where the last one ended"
-        )
-    cruise = np.inf if speed == "max" else speed
-    spline = _spline(kin, phase, cruise)
-    timing = torque = None
-    if speed == "max":
-        made = _made(phases, i)
-        s, rate, torque = _fastest(kin, phase, spline, made)
-        timing, n = np.stack([s, rate]), len(s)
-        rest = TOUCH_REST if made else MIN_REST
-    else:
-        n, rest = profile_samples(spline.length, spline.cruise), REST
-    if i == len(phases) - 1:
-        rest = HOLD_END
-    lead = 0 if i else round(HOLD_START * RATE)
-    return Run(spline, n, timing, torque, lead, round(rest * RATE))

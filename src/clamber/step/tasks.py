@@ -8,7 +8,7 @@ link, and the link's material point with it.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.model.core import numbers_of
+from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.scene import Support
 from clamber.model.se3 import frame_from_normal, matrix_from_quat
@@ -209,6 +210,22 @@ def packed_contacts(
         where[i, :3], where[i, 3:7] = c.position, c.quaternion
         where[i, 7:] = _IDENTITY if c.link is None else c.link
     return what, where
+
+
+def contact_rows(kin: Kinematics, contacts: Iterable[Contact]) -> np.ndarray:
+    """(m, nv) velocities of contacts that are zero while they are closed.
+
+    At the present posture: of their points, and of links that lie flat how they turn.
+    """
+    rows = [np.zeros((0, kin.world.model.nv))]
+    for c in contacts:
+        n = kin.world.supports[c.support].normal
+        s = kin.world.surface(c.surface, c.edge)
+        linear, angular = kin.jacobians(s.body, kin.contact_point(c.surface, n, c.edge))
+        rows.append(linear.copy())
+        if s.is_flat and c.edge is None:
+            rows.append(angular.copy())
+    return np.concatenate(rows)
 
 
 def packed_parts(

@@ -1,0 +1,136 @@
+#include "timing.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace clamber {
+
+namespace {
+
+constexpr double RANK = 1e-4;  // of a regularisation against a direction of length one
+constexpr int CONE_EDGES = 4;
+
+}  // namespace
+
+// Constraints at point i but for what comes next, the last row: bounds of u and x, each in
+// units of its own, and shares of a weight along the cones' edges; balance; torques.
+void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, int i,
+                   double share) {
+    const int nv = model_.nv, na = static_cast<int>(model_.dadr.size());
+    const Holding& held = planner_.look(contacts, course.q + i * model_.nq);
+    ContactPointsView points = held.points();
+    points.cone_edges = CONE_EDGES;
+    const TorqueView torque = held.torque();
+    const LoadView load = held.load();
+    const int nf = points.n * CONE_EDGES, rows = 6 + na + 1;
+    n_ = 2 + nf;
+    m_ = n_ + rows;
+    edges_.resize(3 * nf);
+    auto* const edges = reinterpret_cast<double(*)[3]>(edges_.data());
+    cone_generators(points, edges);
+    rows_.resize((6 + na) * nf);
+    load_rows(points, load.com, torque, edges, CONE_EDGES, rows_.data());
+
+    const double weight = model_.mass * GRAVITY;
+    const double u_max = course.u_max[i], x_max = course.x_max[i];
+    const double *inertia = course.inertia + i * nv, *velocity = course.velocity + i * nv;
+    const double* slope = course.slope + i * nv;
+    double moved[2][6];
+    held.wrench_of(planner_.solver.kin, inertia, moved[0]);
+    held.wrench_of(planner_.solver.kin, velocity, moved[1]);
+    A_.assign(rows * n_, 0.0);
+    upper_.assign(m_, UNBOUNDED);
+    lower_.assign(m_, 0.0);
+    sense_.assign(m_, INEQUALITY);
+    upper_[0] = upper_[1] = 1.0;
+    lower_[0] = -1.0;
+    for (int r = 0; r < 6 + na; ++r) {
+        double* const row = &A_[r * n_];
+        std::copy_n(&rows_[r * nf], nf, row + 2);
+        const int at = n_ + r;
+        if (r < 6) {
+            row[0] = -moved[0][r] * u_max / share;
+            row[1] = -moved[1][r] * x_max / share;
+            upper_[at] = lower_[at] = load.wrench[r];
+            sense_[at] = EQUALITY;
+            continue;
+        }
+        const int d = model_.dadr[r - 6];
+        // Damping grows with the root of x: its tangent at a quarter is above it everywhere.
+        const double damping = course.damping[d] * slope[d] * std::sqrt(x_max);
+        row[0] = -inertia[d] * u_max / share / weight;
+        row[1] = -(velocity[d] * x_max + damping) / share / weight;
+        const double rest = torque.gravity[d] + 0.25 * damping, most = torque.limits[r - 6];
+        upper_[at] = (rest + most) / weight;
+        lower_[at] = (rest - most) / weight;
+    }
+    lower_[m_ - 1] = -UNBOUNDED;
+    H_.assign(n_ * n_, 0.0);
+    for (int k = 0; k < n_; ++k) H_[k * (n_ + 1)] = RANK;
+}
+
+// As far as can be in a direction of u and x.
+bool TimeLaw::solve(double u, double x) {
+    c_.assign(n_, 0.0);
+    c_[0] = -u;
+    c_[1] = -x;
+    QP qp;
+    qp.n = n_;
+    qp.m = m_;
+    qp.bounded = n_;
+    qp.H = H_.data();
+    qp.c = c_.data();
+    qp.A = A_.data();
+    qp.upper = upper_.data();
+    qp.lower = lower_.data();
+    qp.sense = sense_.data();
+    return solver_.solve(qp) > 0;
+}
+
+void TimeLaw::fastest(const Course& course,
+                      const std::vector<std::vector<Contact>>& stances, double share,
+                      double* x) {
+    const int n = course.n;
+    std::vector<double> most(n, 0.0), slowing(n, 0.0);
+    std::vector<bool> crawls(n, false);
+    const auto look = [&](int i) {
+        pose(course, stances[course.stance[i]], i, share);
+        const double step = 2.0 * (course.s[i + 1] - course.s[i]);
+        A_[(m_ - n_ - 1) * n_] = step * course.u_max[i];
+        A_[(m_ - n_ - 1) * n_ + 1] = course.x_max[i];
+        upper_[m_ - 1] = most[i + 1];
+        return step;
+    };
+    // From how fast a point can be left so that rest can be reached at the end.
+    for (int i = n - 2; i >= 0; --i) {
+        const double step = look(i);
+        if (solve(0.0, 1.0)) {
+            slowing[i] = solver_.x()[0] * course.u_max[i];
+            most[i] = std::max(solver_.x()[1] * course.x_max[i], 0.0);
+            continue;
+        }
+        // |u| + x <= crawl
+        crawls[i] = true;
+        const double c = course.crawl[i];
+        most[i] = std::min(c, (most[i + 1] + step * c) / (1.0 + step));
+        slowing[i] = std::min(0.0, (most[i + 1] - most[i]) / step);
+    }
+    // As fast as can be, within that.
+    x[0] = 0.0;
+    for (int i = 0; i + 1 < n; ++i) {
+        const double step = 2.0 * (course.s[i + 1] - course.s[i]);
+        double u = 0.0;
+        if (crawls[i]) {
+            u = course.crawl[i] - x[i];
+        } else {
+            look(i);
+            upper_[1] = lower_[1] = x[i] / course.x_max[i];
+            // Between rest and the law above, if rounding leaves nothing else.
+            u = solve(1.0, 0.0) ? solver_.x()[0] * course.u_max[i]
+                                : most[i] > 0.0 ? slowing[i] * x[i] / most[i] : 0.0;
+        }
+        x[i + 1] = std::min(std::max(x[i] + step * u, 0.0), most[i + 1]);
+    }
+}
+
+}  // namespace clamber

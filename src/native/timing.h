@@ -1,0 +1,50 @@
+// Path -> the fastest time law along it that joints and contacts can bear: reachability
+// analysis [Pham18] with contact forces as variables of its linear programmes.
+#pragma once
+
+#include <vector>
+
+#include "path.h"
+
+namespace clamber {
+
+// n points of a path q(s), u = d2s/dt2, x = (ds/dt)^2. Generalised forces are those of
+// rest + inertia u + velocity x.
+struct Course {
+    int n = 0;
+    const double* s = nullptr;         // (n,) increasing
+    const double* q = nullptr;         // (n, nq)
+    const double* slope = nullptr;     // (n, nv) dq/ds
+    const double* inertia = nullptr;   // (n, nv)
+    const double* velocity = nullptr;  // (n, nv)
+    const int* stance = nullptr;       // (n,) which contacts may bear
+    const double* u_max = nullptr;     // (n,) bound of |u|
+    const double* x_max = nullptr;     // (n,) bound of x
+    const double* crawl = nullptr;     // (n,) bound of |u| + x where not even rest is borne
+    const double* damping = nullptr;   // (nv,) of the joints
+};
+
+class TimeLaw {
+  public:
+    explicit TimeLaw(PathPlanner& planner, const Model& model)
+        : planner_(planner), model_(model) {}
+
+    // x (n,) of the fastest law from rest to rest, zero where there is none. `share`: of
+    // what is left between rest and the border of what can be borne.
+    void fastest(const Course& course, const std::vector<std::vector<Contact>>& stances,
+                 double share, double* x);
+
+  private:
+    void pose(const Course& course, const std::vector<Contact>& contacts, int i,
+              double share);
+    bool solve(double u, double x);
+
+    PathPlanner& planner_;
+    const Model& model_;
+    QPSolver solver_;
+    std::vector<double> H_, c_, A_, upper_, lower_, edges_, rows_;
+    std::vector<int> sense_;
+    int n_ = 0, m_ = 0;  // variables u, x, shares of the cones' edges; constraints
+};
+
+}  // namespace clamber
