@@ -91,8 +91,7 @@ void TimeLaw::fastest(const Course& course,
                       const std::vector<std::vector<Contact>>& stances, double share,
                       double* x) {
     const int n = course.n;
-    std::vector<double> most(n, 0.0), slowing(n, 0.0);
-    std::vector<bool> crawls(n, false);
+    std::vector<double> most(n, 0.0), slowing(n, 0.0);  // x, and u / x at it
     const auto look = [&](int i) {
         pose(course, stances[course.stance[i]], i, share);
         const double step = 2.0 * (course.s[i + 1] - course.s[i]);
@@ -101,34 +100,26 @@ void TimeLaw::fastest(const Course& course,
         upper_[m_ - 1] = most[i + 1];
         return step;
     };
-    // From how fast a point can be left so that rest can be reached at the end.
+    // From how fast a point can be left so that rest can be reached at the end. So slow
+    // that |u| + x <= crawl, inertia is nothing, whatever is left of the limits.
     for (int i = n - 2; i >= 0; --i) {
-        const double step = look(i);
+        const double step = look(i), crawl = course.crawl[i];
+        most[i] = std::min(crawl, (most[i + 1] + step * crawl) / (1.0 + step));
         if (solve(0.0, 1.0)) {
-            slowing[i] = solver_.x()[0] * course.u_max[i];
-            most[i] = std::max(solver_.x()[1] * course.x_max[i], 0.0);
-            continue;
+            slowing[i] = solver_.x()[0] * course.u_max[i] / solver_.x()[1] / course.x_max[i];
+            most[i] = std::max(most[i], solver_.x()[1] * course.x_max[i]);
         }
-        // |u| + x <= crawl
-        crawls[i] = true;
-        const double c = course.crawl[i];
-        most[i] = std::min(c, (most[i + 1] + step * c) / (1.0 + step));
-        slowing[i] = std::min(0.0, (most[i + 1] - most[i]) / step);
     }
     // As fast as can be, within that.
     x[0] = 0.0;
     for (int i = 0; i + 1 < n; ++i) {
-        const double step = 2.0 * (course.s[i + 1] - course.s[i]);
-        double u = 0.0;
-        if (crawls[i]) {
-            u = course.crawl[i] - x[i];
-        } else {
-            look(i);
-            upper_[1] = lower_[1] = x[i] / course.x_max[i];
-            // Between rest and the law above, if rounding leaves nothing else.
-            u = solve(1.0, 0.0) ? solver_.x()[0] * course.u_max[i]
-                                : most[i] > 0.0 ? slowing[i] * x[i] / most[i] : 0.0;
-        }
+        const double step = look(i);
+        double u = course.crawl[i] - x[i];
+        upper_[1] = lower_[1] = x[i] / course.x_max[i];
+        if (solve(1.0, 0.0))
+            u = std::max(u, solver_.x()[0] * course.u_max[i]);
+        else if (u < 0.0)
+            u = slowing[i] * x[i];  // between rest and the law above: only rounding
         x[i + 1] = std::min(std::max(x[i] + step * u, 0.0), most[i + 1]);
     }
 }

@@ -20,7 +20,7 @@ struct Course {
     const int* stance = nullptr;       // (n,) which contacts may bear
     const double* u_max = nullptr;     // (n,) bound of |u|
     const double* x_max = nullptr;     // (n,) bound of x
-    const double* crawl = nullptr;     // (n,) bound of |u| + x where not even rest is borne
+    const double* crawl = nullptr;     // (n,) |u| + x that is always borne
     const double* damping = nullptr;   // (nv,) of the joints
 };
 

@@ -41,7 +41,8 @@ from clamber.planning.timing import (
     sample_law,
 )
 from clamber.step.change import Change
-from clamber.step.path import Phase
+from clamber.step.ik import IK
+from clamber.step.path import Phase, straightened
 from clamber.step.tasks import contact_rows, packed_contacts
 
 HOLD_START = 0.3  # [s]
@@ -381,6 +382,10 @@ def timed(
     phases = [*lead, *(p for change in changes for p in change.phases)]
     if not phases:
         return None
+    ik = IK(world)
+    for i in range(len(lead), len(phases) - 1):
+        if (phases[i].kind, phases[i + 1].kind) == ("settle", "shift"):
+            phases[i : i + 2] = straightened(ik, *phases[i : i + 2]) or phases[i : i + 2]
     ends = np.cumsum([len(lead), *(len(change.phases) for change in changes)])
     return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
 

@@ -10,7 +10,7 @@ distance a constraint, so the push is the constraint's doing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -189,6 +189,36 @@ def bridge(
 ) -> np.ndarray:
     """(n, nq) postures from `a` to `b`, all contacts closed, near the straight way."""
     return ik.core.bridge(a, b, *packed_contacts(ik.world, contacts))
+
+
+def straightened(ik: IK, settle: Phase, shift: Phase) -> tuple[Phase, Phase] | None:
+    """Two phases of one stance, from the first posture to the last without a detour.
+
+    The posture in which the new contact is best loaded lies between them; on the way to
+    the next change the robot need not come by. It is left halfway along the new way.
+
+    Args:
+        ik: Workspace.
+        settle: A contact has been made.
+        shift: The next one is to be changed.
+
+    Returns:
+        None where the stance is another one, or that way cannot be gone.
+    """
+    contacts = settle.contacts
+    if {(c.surface, c.edge) for c in contacts} != {
+        (c.surface, c.edge) for c in shift.contacts
+    }:
+        return None
+    q = bridge(ik, settle.q[0], shift.q[-1], contacts)
+    parts = packed_parts(ik.world, contacts, (), None)
+    status, *_ = ik.core.check_path([q[:1], q, q[-1:]], parts)
+    if status:  # what is wrong with it
+        return None
+    if len(q) == 2:
+        q = np.stack([q[0], interpolate(ik.kin, *q, 0.5), q[1]])
+    half = len(q) // 2
+    return replace(settle, q=q[: half + 1]), replace(shift, q=q[half:])
 
 
 def watched_pairs(world: World, contacts: Sequence[Contact]) -> np.ndarray:
