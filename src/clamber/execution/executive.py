@@ -66,7 +66,9 @@ START_DRIFT = 0.010  # [m] of the start, as far as the arms reach
 ARM = 0.3  # [m] of it, by which a turn of the start counts
 MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
-THINKING = 1.0  # [s] the robot stands still while the rest is planned again
+THINKING = 0.1  # [s] the robot stands still while the rest is planned again
+SEARCHING = 1.0  # [s] ... where other contacts are looked for
+FEEL = 0.08  # [s] later than planned that a contact may be felt
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for such a load
@@ -174,7 +176,7 @@ class Executive:
 
     def decide(self, look: bool) -> None:
         """What to follow next; `look` once every `LOOK_STRIDE` steps."""
-        if look and self._slow:
+        if look:
             self.watch.look(self.estimate.load, self._in_use)
         next(self._behaviour)
 
@@ -184,8 +186,6 @@ class Executive:
 
     def balance(self) -> None:
         """Move the centre of mass from its reference where balance asks for it."""
-        if not self._slow:  # in faster motion the robot need not balance statically
-            return
         ref, change = self._ref, self._at_hand.change
         closed = ref.closed.tobytes()
         if self._closed != (change, closed):
@@ -275,7 +275,13 @@ class Executive:
         if ref.i < span.touch and self.estimate.deviation(c)[0] > DEVIATION:
             yield from self._take(c, c)
             return True
-        yield from ref.play(span.touch)
+        late = min(span.touch + round(FEEL / PHYSICS_STEP), span.end)
+        self.estimate.expect(c)
+        yield from ref.play(late, until=lambda: ref.i >= span.touch and touches(c))
+        self.estimate.expect()
+        if touches(c):
+            return False
+        yield from ref.stop()
         if touches(c):
             return False
         found = yield from self._probe(c)
@@ -332,10 +338,31 @@ class Executive:
         """At a keyframe: the reactions that are due, the most urgent first."""
         if self._at_hand.is_through and not self._at_hand.goes_on:
             return  # the last one: nothing depends on it
+        if not self._is_off():
+            return
+        yield from self._stand()  # what seems to be so in motion may pass
         # What is unintended takes the load of contacts, which are not lost.
         for react in (self._retreat_from_here, self._recover, self._accept):
             if (yield from react()):
                 return
+
+    def _is_off(self) -> bool:
+        """Is something unintended loaded, or a contact lost or elsewhere?"""
+        return (
+            self._is_unintended()
+            or any(map(self.estimate.is_lost, self.stance))
+            or any(map(self._is_elsewhere, self.stance))
+        )
+
+    def _is_elsewhere(self, c: Contact) -> bool:
+        actual = self.estimate.substitute(c) or c
+        up, side = self.estimate.deviation(actual)
+        return actual is not c or abs(up) > DEVIATION or side > DRIFT
+
+    def _stand(self) -> Actions:
+        """Come to rest, and look."""
+        yield from self._ref.stop()
+        yield from self._ref.rest(LOOK)
 
     def _end(self) -> Actions:
         """Hold the last posture."""
@@ -414,8 +441,7 @@ class Executive:
         """Is a contact elsewhere than planned? Then the rest is planned from there."""
         actual = tuple(self.estimate.substitute(c) or c for c in self.stance)
         for c, planned in zip(actual, self.stance, strict=True):
-            up, side = self.estimate.deviation(c)
-            if c is not planned or abs(up) > DEVIATION or side > DRIFT:
+            if self._is_elsewhere(planned):
                 self._note_moved(c, planned, made=False)
                 yield from self._replan(actual, actual)
                 return True
@@ -452,7 +478,7 @@ class Executive:
         self, contacts: Sequence[Contact], loaded: Sequence[Contact]
     ) -> Actions:
         """Take the stance as it is and plan the remaining steps again."""
-        yield from self._ref.rest(LOOK)
+        yield from self._stand()
         estimate = self.estimate
         off = max(max(abs(u), s) for u, s in map(estimate.deviation, contacts))
         if len(contacts) < len(self.stance):
@@ -469,7 +495,7 @@ class Executive:
         )
         scene = estimate.scene(self._plan.world.scene)
         found = _rest(self._plan, scene, now, off, self.watch.clearance)
-        yield from self._ref.rest(THINKING)
+        yield from self._ref.rest(THINKING if off < FALLBACK else SEARCHING)
         yield from self._follow(found, off)
 
     def _follow(self, found: Plan, off: float) -> Actions:

@@ -20,6 +20,8 @@ from clamber.planning.trajectory import Trajectory
 
 BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
+RESTS = 1e-3  # [rad/s] a trajectory that is slower rests
+RAMP = 0.15  # [s] to rest on the way, and from rest to the planned speed again
 
 # What was commanded is written down, and commands are given, in multiples of a
 # microradian or micrometre, of what single precision holds of a rotation, 0.03 mrad/s
@@ -49,7 +51,7 @@ class Reference:
         self.torque, self.closed = now.torque, now.closed
         self._rows: list[tuple[np.ndarray, ...]] = []  # of the track, less q
         self._steps: list[int] = []  # that each of them was followed
-        self.left_plan, self._way = False, 0
+        self.left_plan = False
         self.follow(trajectory, 0)
         self._load(trajectory, slice(1))
         self.track.advance()
@@ -58,31 +60,60 @@ class Reference:
     @property
     def i(self) -> int:
         """The sample of the trajectory that was reached."""
-        return self._begin + self._way * self.track.done
+        done = self.track.done
+        return int(self._at[done - 1]) if done and len(self._at) else self._begin
+
+    @property
+    def moves(self) -> bool:
+        """The trajectory is being followed, and does not rest where it is."""
+        t, i = self.trajectory, self.i
+        return not self._still and bool(np.abs(t.v[i]).max() > RESTS)
 
     def follow(self, trajectory: Trajectory, i: int) -> None:
-        """Go on from sample `i` of another trajectory."""
-        self.trajectory, self._begin, self._way = trajectory, i, 0
+        """Go on, from rest, at sample `i` of another trajectory."""
+        self.trajectory, self._begin, self._still = trajectory, i, True
+        self._at = np.zeros(0)  # of each row, the sample of the trajectory
         self._offset: tuple[np.ndarray, np.ndarray, int] | None = None
 
     def play(self, to: int, until: Callable[[], bool] | None = None) -> Actions:
-        """Follow the trajectory to sample `to`, or until something happens."""
-        if self.i < to and not (until is not None and until()):
-            self._load(self.trajectory, slice(self.i + 1, to + 1), way=1)
+        """Follow the trajectory to sample `to`, or until something happens.
+
+        From where the robot has come to rest on the way, at first more slowly.
+        """
+        i = self.i
+        if i < to and not (until is not None and until()):
+            if self._still and i >= 0 and np.abs(self.trajectory.v[i]).max() > RESTS:
+                self._load_at(i, to, up=True)
+            else:
+                self._load(self.trajectory, slice(i + 1, to + 1), plays=True)
+            self._still = False
             yield
             while self.i < to and not (until is not None and until()):
                 yield
 
+    def stop(self) -> Actions:
+        """Slow down along the trajectory, to rest before a limb leaves."""
+        if not self.moves:
+            return
+        i, t = self.i, self.trajectory
+        leaves = (x.begin for x in t.segments if x.kind == "swing" and x.begin > i)
+        by = min(next(leaves, len(t.time)) - 1, i + round(0.5 * RAMP / PHYSICS_STEP))
+        self.left_plan = self._still = True
+        if by > i:
+            self._load_at(i, by, down=True)
+            yield from self._done()
+
     def back(self, to: int) -> Actions:
-        """Follow the trajectory back to sample `to`."""
-        self.left_plan = True
+        """Come to rest, and follow the trajectory back to rest at sample `to`."""
+        yield from self.stop()
+        self.left_plan = self._still = True
         if self.i > to:
-            self._load(self.trajectory, slice(to, self.i), way=-1, back=True)
+            self._load_at(self.i, to, up=True, down=True)
             yield from self._done()
 
     def aside(self, t: Trajectory, until: Callable[[], bool]) -> Actions:
         """Follow another trajectory until something happens, or there and back."""
-        self.left_plan = True
+        self.left_plan = self._still = True
         self._load(t, slice(None))
         for _ in self._done():
             yield
@@ -98,11 +129,12 @@ class Reference:
 
     def hold(self, seconds: float) -> Actions:
         """Stand still."""
+        self._still = True
         steps, still = round(seconds / PHYSICS_STEP), np.zeros((1, len(self._dadr)))
         now = self.q, self.torque, self.closed
         q, torque, closed = (x[None].copy() for x in now)
         ahead = self._ahead(np.array([self.i]))
-        self._begin_rows(q, still, torque, closed, ahead, way=0, steps=steps)
+        self._begin_rows(q, still, torque, closed, ahead, np.zeros(0), steps)
         yield from self._done()
 
     def resume(self) -> None:
@@ -144,14 +176,14 @@ class Reference:
         )
 
     def _load(
-        self, t: Trajectory, rows: slice, *, way: int = 0, back: bool = False
+        self, t: Trajectory, rows: slice, *, plays: bool = False, back: bool = False
     ) -> None:
         """Follow samples of a trajectory from the next step on.
 
         Args:
             t: The trajectory.
             rows: Its samples.
-            way: By how much each takes the trajectory at hand on.
+            plays: It is the one at hand, which goes on with them.
             back: The last of them first.
         """
         parts = t.q[rows], t.v[rows][:, self._dadr], t.tau[rows], t.contact[rows]
@@ -159,12 +191,40 @@ class Reference:
             parts = parts[0], -parts[1], *parts[2:]
             parts = tuple(x[::-1] for x in parts)
         q, velocity, torque, closed = map(np.ascontiguousarray, parts)
-        at = self.i + way * np.arange(1, len(q) + 1)
+        at = np.arange(rows.start, rows.stop) if plays else np.zeros(0)
+        if plays and self._offset is not None:
+            q, torque, velocity = q.copy(), torque.copy(), velocity.copy()
+            self._blend(at, np.ones(len(at)), q, velocity, torque)
+        ahead = self._ahead(at if plays else np.full(len(q), self.i))
+        self._begin_rows(q, velocity, torque, closed, ahead, at, len(q))
+
+    def _load_at(self, i: int, to: int, *, up: bool = False, down: bool = False) -> None:
+        """Follow the trajectory at hand between two samples, slower at its ends.
+
+        Args:
+            i, to: From this sample to that one.
+            up: From rest.
+            down: To rest.
+        """
+        way = 1 if to > i else -1
+        done, rate = ramped(abs(to - i), up=up, down=down)
+        at = i + way * done
+        t, low = self.trajectory, np.floor(at).astype(int)
+        first, share = low.min(), (at - low)[:, None]
+        rows = slice(first, min(low.max() + 2, len(t.time)))
+        low, high = low - first, np.minimum(low + 1, len(t.time) - 1) - first
+
+        def between(x: np.ndarray) -> np.ndarray:
+            return x[low] + share * (x[high] - x[low])
+
+        q, v, torque = (between(x[rows]) for x in (t.q, t.v, t.tau))
+        velocity = way * rate[:, None] * v[:, self._dadr]
+        closed = t.contact[rows][low]
         if self._offset is not None and way == 1:
-            q, torque = q.copy(), torque.copy()
-            self._blend(at - self._offset[2], q, velocity, torque)
-        rest = {"way": way, "steps": len(q)}
-        self._begin_rows(q, velocity, torque, closed, self._ahead(at), **rest)
+            self._blend(at, rate, q, velocity, torque)
+        self._begin_rows(
+            q, velocity, torque, closed, self._ahead(low + first), at, len(q)
+        )
 
     def _begin_rows(
         self,
@@ -173,11 +233,10 @@ class Reference:
         torque: np.ndarray,
         closed: np.ndarray,
         ahead: np.ndarray,
-        *,
-        way: int,
+        at: np.ndarray,
         steps: int,
     ) -> None:
-        self._begin, self._way = self.i, way
+        self._begin, self._at = self.i, np.floor(at + 1e-9).astype(int)
         if self._rows:
             self._steps.append(self.track.done)
         self.track.load(q, velocity, torque, closed, ahead, steps)
@@ -189,24 +248,55 @@ class Reference:
             yield
 
     def _ahead(self, at: np.ndarray) -> np.ndarray:
-        """(n, nS) bool, contacts a little later than at samples (n,)."""
-        contact = self.trajectory.contact
-        return contact[np.minimum(at + round(AHEAD / PHYSICS_STEP), len(contact) - 1)]
+        """(n, nS) bool, contacts that lie flat a little later than at samples (n,)."""
+        t = self.trajectory
+        later = np.minimum(at + round(AHEAD / PHYSICS_STEP), len(t.contact) - 1)
+        out = t.contact[later]
+        for x in t.segments:  # on tiptoe nothing but its ankle holds a foot
+            if x.edges and x.begin <= later[-1] and later[0] < x.end:
+                rows = (x.begin <= later) & (later < x.end)
+                out[np.ix_(rows, [s in x.edges for s in t.surfaces])] = False
+        return out
 
     def _blend(
-        self, k: np.ndarray, q: np.ndarray, velocity: np.ndarray, torque: np.ndarray
+        self,
+        at: np.ndarray,
+        rate: np.ndarray,
+        q: np.ndarray,
+        velocity: np.ndarray,
+        torque: np.ndarray,
     ) -> None:
-        """Add what is left of the way back, `k` (n,) steps after its begin, to rows."""
+        """Add what is left of the way back to rows at samples (n,), at rates (n,)."""
         assert self._offset is not None
-        offset, push, _ = self._offset
+        offset, push, begin = self._offset
         n = round(BLEND / PHYSICS_STEP)
-        k = k[k <= n]
+        k = at[at <= begin + n] - begin
         share = 0.5 + 0.5 * np.cos(np.pi * k / n)
-        rate = -0.5 * np.pi / BLEND * np.sin(np.pi * k / n)
+        rate = -0.5 * np.pi / BLEND * np.sin(np.pi * k / n) * rate[: len(k)]
         for row, s in zip(q, share, strict=False):
             row[:] = self._kin.integrate(row, s * offset)
         torque[: len(k)] += share[:, None] * push
         velocity[: len(k)] += rate[:, None] * offset[self._dadr]
+
+
+def ramped(
+    distance: int, *, up: bool = False, down: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of the way done (n,) at each step, and the rate (n,) in [0, 1].
+
+    Args:
+        distance: The way in samples, which take a step each at the planned speed.
+        up: From rest.
+        down: To rest.
+    """
+    ramps = up + down
+    n = min(round(RAMP / PHYSICS_STEP), 2 * distance // max(ramps, 1)) // 2 * 2
+    rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / max(n, 1))
+    rate = np.ones(distance - ramps * n // 2)
+    rate = np.concatenate([rise[: n * up], rate, rise[::-1][: n * down]])
+    done = np.cumsum(rate)
+    done[-1] = distance
+    return done, rate
 
 
 def in_steps(t: Trajectory) -> Trajectory:

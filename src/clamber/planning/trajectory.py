@@ -64,6 +64,7 @@ class Segment:
             first of them, and where a posture is held.
         begin, end: Its first sample, and the first one after it.
         makes: The contact that is closed from `end` on, if any.
+        edges: Flat surfaces that are in contact with an edge: feet on tiptoe.
     """
 
     kind: str
@@ -71,6 +72,7 @@ class Segment:
     begin: int
     end: int
     makes: Contact | None = None
+    edges: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -406,6 +408,7 @@ def _segments(
                 begin=out[-1].end,
                 end=min(stops[i], still),
                 makes=_made(phases, i),
+                edges=tuple(c.surface for c in phase.contacts if c.edge is not None),
             )
         )
     out.append(Segment(kind="hold", change=None, begin=still, end=stops[-1]))
