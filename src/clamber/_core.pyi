@@ -503,9 +503,9 @@ class Workspace:
         damping: np.ndarray,
         share: float,
     ) -> np.ndarray:
-        """(n,) squared rate of the fastest law along a path.
+        """(n + 1,) squared rate of the fastest law between n intervals of a path.
 
-        Limits (4, n): s, bounds of |u|, of x, of |u| + x where not even rest is borne.
+        Limits (5, n): lengths, bounds of |u| and x, and those that are always borne.
         """
 
     def bridge(

@@ -500,7 +500,7 @@ void bind_posture(nb::module_& m) {
                  check_size(stance.size(), n, "stance");
                  for (const Array2<>* x : {&slope, &inertia, &velocity})
                      check_size(x->size(), n * nv, "generalised forces");
-                 check_size(limits.size(), 4 * n, "limits");
+                 check_size(limits.size(), 5 * n, "limits");
                  check_size(damping.size(), nv, "damping");
                  for (std::size_t i = 0; i < n; ++i)
                      index(stance.data()[i], stances.size(), "stance");
@@ -511,12 +511,13 @@ void bind_posture(nb::module_& m) {
                  course.inertia = inertia.data();
                  course.velocity = velocity.data();
                  course.stance = stance.data();
-                 course.s = limits.data();
+                 course.length = limits.data();
                  course.u_max = limits.data() + n;
                  course.x_max = limits.data() + 2 * n;
-                 course.crawl = limits.data() + 3 * n;
+                 course.u_slow = limits.data() + 3 * n;
+                 course.x_slow = limits.data() + 4 * n;
                  course.damping = damping.data();
-                 std::vector<double> x(n, 0.0);
+                 std::vector<double> x(n + 1, 0.0);
                  if (n) {
                      nb::gil_scoped_release released;
                      const std::lock_guard lock(w.busy);
@@ -524,8 +525,9 @@ void bind_posture(nb::module_& m) {
                  }
                  return own(std::move(x));
              },
-             "(n,) squared rate of the fastest law along a path; limits (4, n): s, bounds of "
-             "|u|, of x, and of |u| + x where not even rest is borne.")
+             "(n + 1) squared rate of the fastest law between n intervals of a path; limits "
+             "(5, n): lengths, bounds of |u| and of x, and |u| and x so slow that they are "
+             "always borne.")
         .def("bridge",
              [](Workspace& w, const Array1<>& a, const Array1<>& b, const Array2<int>& what,
                 const Array2<>& where) {

@@ -9,11 +9,13 @@ namespace {
 
 constexpr double RANK = 1e-4;  // of a regularisation against a direction of length one
 constexpr int CONE_EDGES = 4;
+constexpr int END = -2, BEGIN = -1;  // rows of constraints, from behind
 
 }  // namespace
 
-// Constraints at point i but for what comes next, the last row: bounds of u and x, each in
-// units of its own, and shares of a weight along the cones' edges; balance; torques.
+// Constraints in interval i: bounds of u and x, each in units of its own, and shares of a
+// weight along the cones' edges; balance; torques; x at the end, and at the begin, which
+// are bounded later.
 void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, int i,
                    double share) {
     const int nv = model_.nv, na = static_cast<int>(model_.dadr.size());
@@ -22,7 +24,7 @@ void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, i
     points.cone_edges = CONE_EDGES;
     const TorqueView torque = held.torque();
     const LoadView load = held.load();
-    const int nf = points.n * CONE_EDGES, rows = 6 + na + 1;
+    const int nf = points.n * CONE_EDGES, rows = 6 + na + 2;
     n_ = 2 + nf;
     m_ = n_ + rows;
     edges_.resize(3 * nf);
@@ -64,16 +66,24 @@ void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, i
         upper_[at] = (rest + most) / weight;
         lower_[at] = (rest - most) / weight;
     }
-    lower_[m_ - 1] = -UNBOUNDED;
+    const double step = course.length[i] * u_max / x_max;
+    double* const ends = &A_[(6 + na) * n_];
+    ends[0] = step;
+    ends[n_] = -step;
+    ends[1] = ends[n_ + 1] = 1.0;
     H_.assign(n_ * n_, 0.0);
     for (int k = 0; k < n_; ++k) H_[k * (n_ + 1)] = RANK;
 }
 
-// As far as can be in a direction of u and x.
-bool TimeLaw::solve(double u, double x) {
+// x as large as can be at the end of the interval (END), or at its begin (BEGIN).
+bool TimeLaw::solve(int towards) {
+    const double* const row = &A_[(m_ - n_ + towards) * n_];
     c_.assign(n_, 0.0);
-    c_[0] = -u;
-    c_[1] = -x;
+    c_[0] = -row[0];
+    c_[1] = -row[1];
+    const double size = std::hypot(c_[0], c_[1]);
+    c_[0] /= size;
+    c_[1] /= size;
     QP qp;
     qp.n = n_;
     qp.m = m_;
@@ -91,36 +101,37 @@ void TimeLaw::fastest(const Course& course,
                       const std::vector<std::vector<Contact>>& stances, double share,
                       double* x) {
     const int n = course.n;
-    std::vector<double> most(n, 0.0), slowing(n, 0.0);  // x, and u / x at it
-    const auto look = [&](int i) {
+    std::vector<double> most(n + 1, 0.0), slowing(n, 0.0);  // x, and u / x at it
+    // From how fast an interval can be begun so that rest can be reached at the end. So
+    // slow that |u| / u_slow + x / x_slow <= 1, inertia is nothing, whatever is left.
+    for (int i = n - 1; i >= 0; --i) {
+        const double next = most[i + 1], length = course.length[i];
+        const double slow = course.x_slow[i], brake = length * course.u_slow[i];
+        const double least = std::max(slow - next, 0.0) / (slow + brake);
+        for (const double r : {least, slow / (slow + brake)})
+            most[i] = std::max(most[i], (1.0 - r) * slow + r * brake);
         pose(course, stances[course.stance[i]], i, share);
-        const double step = 2.0 * (course.s[i + 1] - course.s[i]);
-        A_[(m_ - n_ - 1) * n_] = step * course.u_max[i];
-        A_[(m_ - n_ - 1) * n_ + 1] = course.x_max[i];
-        upper_[m_ - 1] = most[i + 1];
-        return step;
-    };
-    // From how fast a point can be left so that rest can be reached at the end. So slow
-    // that |u| + x <= crawl, inertia is nothing, whatever is left of the limits.
-    for (int i = n - 2; i >= 0; --i) {
-        const double step = look(i), crawl = course.crawl[i];
-        most[i] = std::min(crawl, (most[i + 1] + step * crawl) / (1.0 + step));
-        if (solve(0.0, 1.0)) {
-            slowing[i] = solver_.x()[0] * course.u_max[i] / solver_.x()[1] / course.x_max[i];
-            most[i] = std::max(most[i], solver_.x()[1] * course.x_max[i]);
-        }
+        upper_[m_ + END] = next / course.x_max[i];
+        if (!solve(BEGIN)) continue;
+        const double u = solver_.x()[0] * course.u_max[i];
+        const double begin = solver_.x()[1] * course.x_max[i] - length * u;
+        if (begin <= most[i]) continue;
+        most[i] = begin;
+        slowing[i] = u / begin;
     }
     // As fast as can be, within that.
     x[0] = 0.0;
-    for (int i = 0; i + 1 < n; ++i) {
-        const double step = look(i);
-        double u = course.crawl[i] - x[i];
-        upper_[1] = lower_[1] = x[i] / course.x_max[i];
-        if (solve(1.0, 0.0))
-            u = std::max(u, solver_.x()[0] * course.u_max[i]);
-        else if (u < 0.0)
-            u = slowing[i] * x[i];  // between rest and the law above: only rounding
-        x[i + 1] = std::min(std::max(x[i] + step * u, 0.0), most[i + 1]);
+    for (int i = 0; i < n; ++i) {
+        const double length = course.length[i], slow = course.x_slow[i];
+        pose(course, stances[course.stance[i]], i, share);
+        upper_[m_ + END] = most[i + 1] / course.x_max[i];
+        upper_[m_ + BEGIN] = lower_[m_ + BEGIN] = x[i] / course.x_max[i];
+        sense_[m_ + BEGIN] = EQUALITY;
+        double u = slowing[i] * x[i];  // between rest and the law above: only rounding
+        if (x[i] <= slow)
+            u = (1.0 - x[i] / slow) / (1.0 / course.u_slow[i] + length / slow);
+        if (solve(END)) u = std::max(x[i] <= slow ? u : -UNBOUNDED, solver_.x()[0] * course.u_max[i]);
+        x[i + 1] = std::min(std::max(x[i] + 2.0 * length * u, 0.0), most[i + 1]);
     }
 }
 

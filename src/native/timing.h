@@ -8,11 +8,11 @@
 
 namespace clamber {
 
-// n points of a path q(s), u = d2s/dt2, x = (ds/dt)^2. Generalised forces are those of
-// rest + inertia u + velocity x.
+// A path q(s) in n intervals, looked at in their middles; u = d2s/dt2, constant in each,
+// x = (ds/dt)^2. Generalised forces are those of rest + inertia u + velocity x.
 struct Course {
     int n = 0;
-    const double* s = nullptr;         // (n,) increasing
+    const double* length = nullptr;    // (n,) of the intervals
     const double* q = nullptr;         // (n, nq)
     const double* slope = nullptr;     // (n, nv) dq/ds
     const double* inertia = nullptr;   // (n, nv)
@@ -20,7 +20,8 @@ struct Course {
     const int* stance = nullptr;       // (n,) which contacts may bear
     const double* u_max = nullptr;     // (n,) bound of |u|
     const double* x_max = nullptr;     // (n,) bound of x
-    const double* crawl = nullptr;     // (n,) |u| + x that is always borne
+    const double* u_slow = nullptr;    // (n,) |u|, and x, so slow that it is always borne
+    const double* x_slow = nullptr;
     const double* damping = nullptr;   // (nv,) of the joints
 };
 
@@ -29,7 +30,7 @@ class TimeLaw {
     explicit TimeLaw(PathPlanner& planner, const Model& model)
         : planner_(planner), model_(model) {}
 
-    // x (n,) of the fastest law from rest to rest, zero where there is none. `share`: of
+    // x (n + 1) between the intervals of the fastest law from rest to rest. `share`: of
     // what is left between rest and the border of what can be borne.
     void fastest(const Course& course, const std::vector<std::vector<Contact>>& stances,
                  double share, double* x);
@@ -37,7 +38,7 @@ class TimeLaw {
   private:
     void pose(const Course& course, const std::vector<Contact>& contacts, int i,
               double share);
-    bool solve(double u, double x);
+    bool solve(int towards);
 
     PathPlanner& planner_;
     const Model& model_;

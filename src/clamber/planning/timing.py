@@ -1,12 +1,13 @@
 """Path -> the fastest time law along all of it that joints and contacts can bear.
 
 With q(s) given, joint torques and contact forces are linear in u = d2s/dt2 and
-x = (ds/dt)^2 [Bobrow85]. At each point of the path some forces within the friction
-cones and some torques within the limits must produce (u, x): how fast each point may be
-left is found from the end backwards, then the law from the start, by a small LP each
-with the forces as variables [Hauser14, Pham18]. Only the two ends are at rest.
+x = (ds/dt)^2 [Bobrow85]. In the middle of each interval of the path some forces within
+the friction cones and some torques within the limits must produce (u, x): how fast each
+interval may be begun is found from the end backwards, then the law from the start, by a
+small LP each with the forces as variables [Hauser14, Pham18]. Only the two ends are at
+rest. Where the path itself turns back its tangent is zero: there s goes on.
 
-Shapes: n points of the path, nv velocities.
+Shapes: n intervals of the path, nv velocities.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ JOINT_SPEED = 4.0  # [rad/s] that `max` stands for
 QUICKNESS = 6.0
 BASE_LENGTH = 0.3  # [m] of base translation count as one radian
 INERTIA_SHARE = 0.6  # of what is left between rest and the border of what can be borne
-SLOW = 0.3  # [rad/s] where not even rest is within the limits
+# [rad/s] of the fastest joint, and [1/s] its acceleration against that: inertia is
+# nothing, and where not even rest is within the limits the robot moves like this.
+SLOW, SLOWLY = 0.3, 2.0
 TOUCH_SPEED = 0.08  # [m/s] along the normal, near a contact to be made
 TOUCH_ZONE = 0.012  # [m] what is near
 SMOOTHING = 0.06  # [s] width of the kernel that rounds the acceleration's corners
@@ -42,11 +45,11 @@ _FLAT = 1e-3  # a path is no flatter than this: where nothing moves, nothing is 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Course:
-    """Points of a path.
+    """A path in intervals.
 
     Attributes:
-        s: (n,) increasing; the first and the last are at rest.
-        q: (n, nq).
+        s: (n + 1,) increasing, their ends; the first and the last are at rest.
+        q: (n, nq) in their middles.
         slope: (n, nv) dq/ds on the manifold.
         bend: (n, nv) its derivative, d2q/ds2.
         stance: (n,) of `stances`, which contacts may bear.
@@ -92,7 +95,7 @@ def fastest(
     inertia: tuple[np.ndarray, np.ndarray],
     speed: Speed,
 ) -> np.ndarray:
-    """(n,) squared rate (ds/dt)^2 of the fastest law from rest to rest.
+    """(n + 1,) squared rate (ds/dt)^2 of the fastest law from rest to rest.
 
     Args:
         kin: Workspace.
@@ -111,14 +114,21 @@ def fastest(
     x_max = np.minimum((v / steep) ** 2, QUICKNESS * v / bend)
     for i in np.flatnonzero(course.makes >= 0):
         x_max[i] = min(x_max[i], _gentle(kin, course, i))
-    crawl = (min(v, SLOW) / steep) ** 2
+    slow = min(v, SLOW)
+    x_slow = np.minimum((slow / steep) ** 2, SLOWLY * slow / bend)
     return kin.core.time_law(
         [packed_contacts(w, c) for c in course.stances],
         course.stance.astype(np.int32),
         course.q,
         course.slope,
         *inertia,
-        np.stack([course.s, QUICKNESS * v / steep, x_max, crawl]),
+        np.stack(
+            [
+                np.diff(course.s),
+                *(QUICKNESS * v / steep, x_max),
+                *(SLOWLY * slow / steep, x_slow),
+            ]
+        ),
         w.model.dof_damping,
         INERTIA_SHARE,
     )
@@ -139,11 +149,11 @@ def _gentle(kin: Kinematics, course: Course, i: int) -> float:
 def sample_law(s: np.ndarray, x: np.ndarray) -> np.ndarray:
     """(2, m) path s and ds/dt at each millisecond after the start, made smooth.
 
-    Between grid points the acceleration is constant. The law is averaged over a window
+    In each interval the acceleration is constant. The law is averaged over a window
     of time, so that its acceleration has no steps; the rate stays its derivative.
 
     Args:
-        s: (n,) grid.
+        s: (n,) ends of intervals.
         x: (n,) squared rates, zero at both ends.
     """
     rate = np.sqrt(x)

@@ -48,9 +48,7 @@ from clamber.step.tasks import contact_rows, packed_contacts
 HOLD_START = 0.3  # [s]
 HOLD_END = 2.0  # [s] the last posture is held
 LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
-GRID_STEP = 0.06  # [rad] between two points of a path, at most; at least 5 of a phase
-GRID_MOST = 24  # points of a phase
-EDGE = 1e-7  # [rad] behind a joint of two phases, where their second derivatives differ
+INTERVAL = 0.06  # [rad] of a path, at most; two of them between two postures, at least
 STEEPER = 2.0  # times the slower side: a tangent there, or the spline swings over
 
 
@@ -316,32 +314,33 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
     """The phases in time."""
     path = _path(kin, phases)
     starts = np.cumsum([0.0, *(s[-1] for s, _, _ in path)])
-    grids, looked, makes = [], [], []
+    edges, middles, looked, makes = [], [], [], []
     made = [_made(phases, i) for i in range(len(phases))]
     for i, (s, postures, ends) in enumerate(path):
-        count = int(np.clip(np.ceil(s[-1] / GRID_STEP), 5, GRID_MOST))
-        grid = np.linspace(0.0, s[-1], count)
-        grid[0] = EDGE if i else 0.0
-        spline = spline_through(s, postures, ends, grid, np.zeros((0, 0)))
-        grids.append(grid)
-        looked.append((*spline.along(grid), _bend(spline.curve, grid)))
-        soon = (made[i] is not None) & (grid > 0.5 * s[-1])
+        parts = np.maximum(np.ceil(np.diff(s) / INTERVAL), 2).astype(int)
+        edge = np.interp(np.arange(parts.sum() + 1), np.cumsum([0, *parts]), s)
+        middle = 0.5 * (edge[1:] + edge[:-1])
+        spline = spline_through(s, postures, ends, middle, np.zeros((0, 0)))
+        edges.append(starts[i] + edge[1:])
+        middles.append(middle)
+        looked.append((*spline.along(middle), _bend(spline.curve, middle)))
+        soon = (made[i] is not None) & (middle > 0.5 * s[-1])
         makes.append(np.where(soon, i, -1))
     q, slope, bend = (np.concatenate(x) for x in zip(*looked, strict=True))
     course = Course(
-        s=np.concatenate([a + g for a, g in zip(starts, grids, strict=False)]),
+        s=np.concatenate([[0.0], *edges]),
         q=q,
         slope=slope,
         bend=bend,
-        stance=np.repeat(np.arange(len(phases)), [len(g) for g in grids]),
+        stance=np.repeat(np.arange(len(phases)), [len(m) for m in middles]),
         stances=[p.contacts for p in phases],
         makes=np.concatenate(makes),
         made=made,
     )
     inertia = of_u, of_x = inertia_along(kin, course)
     x = fastest(kin, course, inertia, speed)
-    u = np.append(np.diff(x) / (2.0 * np.diff(course.s)), 0.0)
-    forces = u[:, None] * of_u + x[:, None] * of_x
+    u = np.diff(x) / (2.0 * np.diff(course.s))
+    forces = u[:, None] * of_u + 0.5 * (x[1:] + x[:-1])[:, None] * of_x
     law = sample_law(course.s, x)
     # A phase has at least one sample, however short it is.
     each = np.arange(len(phases) - 1)
@@ -349,11 +348,11 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
     timings = np.split(law, np.maximum.accumulate(np.maximum(cuts, 1)) + each, axis=1)
     out, row = [], 0
     for i, (phase, (s, postures, ends), grid) in enumerate(
-        zip(phases, path, grids, strict=True)
+        zip(phases, path, middles, strict=True)
     ):
         rows = slice(row, row + len(grid))
         row += len(grid)
-        contacts, prices = handed_over(phase, grid / grid[-1])
+        contacts, prices = handed_over(phase, grid / s[-1])
         tau = holding_torques(kin, q[rows], contacts, prices, forces[rows])
         spline = spline_through(s, postures, ends, grid, tau)
         timing = timings[i].copy()
