@@ -9,13 +9,11 @@ namespace {
 
 constexpr double RANK = 1e-4;  // of a regularisation against a direction of length one
 constexpr int CONE_EDGES = 4;
-constexpr int END = -2, BEGIN = -1;  // rows of constraints, from behind
 
 }  // namespace
 
 // Constraints in interval i: bounds of u and x, each in units of its own, and shares of a
-// weight along the cones' edges; balance; torques; x at the end, and at the begin, which
-// are bounded later.
+// weight along the cones' edges; balance; torques; x at the other end, to be bounded.
 void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, int i,
                    double share) {
     const int nv = model_.nv, na = static_cast<int>(model_.dadr.size());
@@ -24,7 +22,7 @@ void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, i
     points.cone_edges = CONE_EDGES;
     const TorqueView torque = held.torque();
     const LoadView load = held.load();
-    const int nf = points.n * CONE_EDGES, rows = 6 + na + 2;
+    const int nf = points.n * CONE_EDGES, rows = 6 + na + 1;
     n_ = 2 + nf;
     m_ = n_ + rows;
     edges_.resize(3 * nf);
@@ -66,24 +64,16 @@ void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, i
         upper_[at] = (rest + most) / weight;
         lower_[at] = (rest - most) / weight;
     }
-    const double step = course.length[i] * u_max / x_max;
-    double* const ends = &A_[(6 + na) * n_];
-    ends[0] = step;
-    ends[n_] = -step;
-    ends[1] = ends[n_ + 1] = 1.0;
+    A_[(6 + na) * n_ + 1] = 1.0;
     H_.assign(n_ * n_, 0.0);
     for (int k = 0; k < n_; ++k) H_[k * (n_ + 1)] = RANK;
 }
 
-// x as large as can be at the end of the interval (END), or at its begin (BEGIN).
-bool TimeLaw::solve(int towards) {
-    const double* const row = &A_[(m_ - n_ + towards) * n_];
+// As far as can be in a direction of u and x.
+bool TimeLaw::solve(double u, double x) {
     c_.assign(n_, 0.0);
-    c_[0] = -row[0];
-    c_[1] = -row[1];
-    const double size = std::hypot(c_[0], c_[1]);
-    c_[0] /= size;
-    c_[1] /= size;
+    c_[0] = -u;
+    c_[1] = -x;
     QP qp;
     qp.n = n_;
     qp.m = m_;
@@ -102,36 +92,42 @@ void TimeLaw::fastest(const Course& course,
                       double* x) {
     const int n = course.n;
     std::vector<double> most(n + 1, 0.0), slowing(n, 0.0);  // x, and u / x at it
+    // With x at the begin (way 1) or at the end (-1); that of the other end, within bounds.
+    const auto other = [&](int i, int way, double lower, double upper) {
+        A_[(m_ - n_ - 1) * n_] = way * 2.0 * course.length[i] * course.u_max[i] / course.x_max[i];
+        upper_[m_ - 1] = upper / course.x_max[i];
+        lower_[m_ - 1] = lower / course.x_max[i];
+    };
     // From how fast an interval can be begun so that rest can be reached at the end. So
     // slow that |u| / u_slow + x / x_slow <= 1, inertia is nothing, whatever is left.
     for (int i = n - 1; i >= 0; --i) {
-        const double next = most[i + 1], length = course.length[i];
-        const double slow = course.x_slow[i], brake = length * course.u_slow[i];
-        const double least = std::max(slow - next, 0.0) / (slow + brake);
-        for (const double r : {least, slow / (slow + brake)})
-            most[i] = std::max(most[i], (1.0 - r) * slow + r * brake);
+        const double slow = course.x_slow[i], brake = 2.0 * course.length[i] * course.u_slow[i];
+        most[i] = std::min(slow, (most[i + 1] + brake) / (1.0 + brake / slow));
         pose(course, stances[course.stance[i]], i, share);
-        upper_[m_ + END] = next / course.x_max[i];
-        if (!solve(BEGIN)) continue;
-        const double u = solver_.x()[0] * course.u_max[i];
-        const double begin = solver_.x()[1] * course.x_max[i] - length * u;
-        if (begin <= most[i]) continue;
-        most[i] = begin;
-        slowing[i] = u / begin;
+        other(i, 1, 0.0, most[i + 1]);
+        if (!solve(0.0, 1.0)) continue;
+        const double fast = solver_.x()[1] * course.x_max[i];
+        if (fast <= most[i]) continue;
+        most[i] = fast;
+        slowing[i] = solver_.x()[0] * course.u_max[i] / fast;
     }
     // As fast as can be, within that.
     x[0] = 0.0;
     for (int i = 0; i < n; ++i) {
-        const double length = course.length[i], slow = course.x_slow[i];
+        const double slow = course.u_slow[i] * (1.0 - x[i] / course.x_slow[i]);
+        // Between rest and the law above, where rounding leaves nothing else.
+        double u = slow >= 0.0 ? slow : slowing[i] * x[i];
         pose(course, stances[course.stance[i]], i, share);
-        upper_[m_ + END] = most[i + 1] / course.x_max[i];
-        upper_[m_ + BEGIN] = lower_[m_ + BEGIN] = x[i] / course.x_max[i];
-        sense_[m_ + BEGIN] = EQUALITY;
-        double u = slowing[i] * x[i];  // between rest and the law above: only rounding
-        if (x[i] <= slow)
-            u = (1.0 - x[i] / slow) / (1.0 / course.u_slow[i] + length / slow);
-        if (solve(END)) u = std::max(x[i] <= slow ? u : -UNBOUNDED, solver_.x()[0] * course.u_max[i]);
-        x[i + 1] = std::min(std::max(x[i] + 2.0 * length * u, 0.0), most[i + 1]);
+        upper_[1] = std::min(most[i + 1] / course.x_max[i], 1.0);
+        other(i, -1, x[i], x[i]);
+        bool solved = solve(1.0, 0.0) && solver_.x()[0] >= 0.0;
+        if (!solved) {  // slower at the end
+            upper_[1] = lower_[1] = std::min(x[i] / course.x_max[i], 1.0);
+            other(i, 1, 0.0, most[i + 1]);
+            solved = solve(1.0, 0.0);
+        }
+        if (solved) u = std::max(slow, solver_.x()[0] * course.u_max[i]);
+        x[i + 1] = std::min(std::max(x[i] + 2.0 * course.length[i] * u, 0.0), most[i + 1]);
     }
 }
 

@@ -8,8 +8,9 @@
 
 namespace clamber {
 
-// A path q(s) in n intervals, looked at in their middles; u = d2s/dt2, constant in each,
-// x = (ds/dt)^2. Generalised forces are those of rest + inertia u + velocity x.
+// A path q(s) in n intervals. u = d2s/dt2 is constant in each, x = (ds/dt)^2 that of its
+// faster end, and generalised forces are those of rest + inertia u + velocity x in its
+// middle: where the path turns back its tangent is zero, and any u would do just there.
 struct Course {
     int n = 0;
     const double* length = nullptr;    // (n,) of the intervals
@@ -38,7 +39,7 @@ class TimeLaw {
   private:
     void pose(const Course& course, const std::vector<Contact>& contacts, int i,
               double share);
-    bool solve(int towards);
+    bool solve(double u, double x);
 
     PathPlanner& planner_;
     const Model& model_;

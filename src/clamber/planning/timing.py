@@ -1,7 +1,7 @@
 """Path -> the fastest time law along all of it that joints and contacts can bear.
 
 With q(s) given, joint torques and contact forces are linear in u = d2s/dt2 and
-x = (ds/dt)^2 [Bobrow85]. In the middle of each interval of the path some forces within
+x = (ds/dt)^2 [Bobrow85]. In each interval of the path some forces within
 the friction cones and some torques within the limits must produce (u, x): how fast each
 interval may be begun is found from the end backwards, then the law from the start, by a
 small LP each with the forces as variables [Hauser14, Pham18]. Only the two ends are at
