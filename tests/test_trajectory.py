@@ -11,7 +11,6 @@ from scipy.optimize import nnls
 
 from clamber.planning.trajectory import (
     BASE_LENGTH,
-    GRAVITY,
     HOLD_END,
     HOLD_START,
     RATE,
@@ -19,11 +18,10 @@ from clamber.planning.trajectory import (
     build_trajectory,
     handed_over,
     holding_torque,
-    phase_torques,
-    point_prices,
-    zero_moment_point,
+    holding_torques,
 )
-from clamber.step.polygon import com_margin, support_polygon
+from clamber.step.ik import IK
+from clamber.step.path import straightened
 from clamber.step.stability import contact_points, statics_at
 from clamber.step.statics import Load, cone_generators, contact_forces
 
@@ -120,19 +118,27 @@ def test_it_starts_and_ends_at_rest(demo_plan):
     assert np.ptp(trajectory.q[-end:], axis=0).max() == 0.0
 
 
-def test_it_is_at_rest_wherever_contacts_change(demo_plan):
-    trajectory = demo_plan.trajectory
-    changes = 1 + np.flatnonzero(np.diff(trajectory.contact, axis=0).any(axis=1))
+def test_where_contacts_change_none_of_them_moves(demo_plan, demo_kinematics):
+    t, kin = demo_plan.trajectory, demo_kinematics
+    world, up = demo_plan.world, np.array([0.0, 0.0, 1.0])
+    changes = 1 + np.flatnonzero(np.diff(t.contact, axis=0).any(axis=1))
     assert len(changes) >= 2 * len(demo_plan.changes) - 2
+    slides = []
     for k in changes:
-        assert not trajectory.v[k - 1].any()
-        assert np.abs(trajectory.v[k]).max() < 1e-3
+        kin.update(t.q[k])
+        closed = t.contact[k] | t.contact[k - 1]
+        for s in (s for s, on in zip(t.surfaces, closed, strict=True) if on):
+            p = kin.contact_point(s, up)
+            J = kin.point_jacobian(world.surfaces[s].body, p)
+            slides.append(np.linalg.norm(J @ t.v[k]))
+    assert max(slides) < 0.02  # [m/s]
+    assert np.abs(t.v[changes]).max() > 0.1  # while the robot moves
 
 
 def test_velocity_has_no_jumps(demo_plan):
-    # Speed times the profile's acceleration, and what the spline bends by itself.
+    # What may be gained in a millisecond, and what the spline bends by itself.
     steps = np.abs(np.diff(demo_plan.trajectory.v, axis=0)).max() * RATE
-    assert steps < 10.0  # [rad/s^2]
+    assert steps < 30.0  # [rad/s^2]
 
 
 def test_joint_limits_are_respected_at_every_sample(demo_plan):
@@ -164,26 +170,60 @@ def test_the_other_sign_of_a_posture_s_quaternion_changes_nothing(
 def test_it_passes_through_every_posture_of_every_path_in_order(
     demo_plan, demo_kinematics
 ):
-    trajectory, k = demo_plan.trajectory, 0
-    for path in demo_plan.changes:
-        for phase in path.phases:
-            for node in phase.q:
-                window = trajectory.q[k : k + 8000]
-                far = np.abs(window[:, 7:] - node[7:]).max(axis=1)
-                # within half a sample's way at the speed limit
-                first = int(np.flatnonzero(far < 1.6e-4)[0])
-                k += first
-                d = demo_kinematics.difference(trajectory.q[k], node)
-                assert np.abs(d).max() < 2e-3
+    phases = [p for change in demo_plan.changes for p in change.phases]
+    trajectory, k = build_trajectory(demo_plan.world, phases, speed=0.3), 0
+    for phase in phases:
+        for node in phase.q:
+            window = trajectory.q[k : k + 8000]
+            far = np.abs(window[:, 7:] - node[7:]).max(axis=1)
+            # within half a sample's way at the speed limit
+            first = int(np.flatnonzero(far < 1.6e-4)[0])
+            k += first
+            d = demo_kinematics.difference(trajectory.q[k], node)
+            assert np.abs(d).max() < 2e-3
     assert k <= len(trajectory.time)
 
 
-def test_keyframes_are_reached_at_their_times(demo_plan):
-    trajectory = demo_plan.trajectory
-    assert len(trajectory.keyframes) == len(demo_plan.keyframes)
-    assert np.all(np.diff(trajectory.keyframes) > 0)
-    for t, key in zip(trajectory.keyframes, demo_plan.keyframes, strict=True):
-        assert np.allclose(trajectory.q[trajectory.at(t)], key.q, atol=1e-9)
+def test_a_keyframe_is_reached_between_a_touch_and_the_next_lift_off(demo_plan):
+    t = demo_plan.trajectory
+    assert len(t.keyframes) == len(demo_plan.keyframes)
+    assert np.all(np.diff(t.keyframes) > 0)
+    ends = [demo_plan.keyframes[i].q for i in (0, -1)]
+    for time, q in zip(t.keyframes[[0, -1]], ends, strict=True):
+        assert np.allclose(t.q[t.at(time)], q, atol=1e-9)
+    for time, key in zip(t.keyframes, demo_plan.keyframes, strict=True):
+        closed = {s for s, on in zip(t.surfaces, t.contact[t.at(time)], strict=True) if on}
+        assert closed == {c.surface for c in key.stance}
+
+
+def test_the_way_to_the_next_lift_off_is_shorter_than_by_the_keyframe(
+    demo_plan
+):
+    ik, shorter = IK(demo_plan.world), []
+    for a, b in itertools.pairwise(demo_plan.changes):
+        settle, shift = a.phases[2], b.phases[0]
+        found = straightened(ik, settle, shift)
+        if found is None:
+            continue
+        assert np.array_equal(found[0].q[0], settle.q[0])
+        assert np.array_equal(found[1].q[-1], shift.q[-1])
+        assert np.array_equal(found[0].q[-1], found[1].q[0])
+        ways = [
+            np.abs(np.diff(np.concatenate([x.q, y.q])[:, 7:], axis=0)).sum()
+            for x, y in ((settle, shift), found)
+        ]
+        shorter.append(ways[1] / ways[0])
+    assert len(shorter) > 2
+    assert max(shorter) < 1.0 + 1e-6
+    # A foot that is let go on tiptoe stands otherwise: its phases stay as they are.
+    foot = next(c for c in demo_plan.changes[-1].phases[0].contacts if "Foot" in c.surface)
+    rolled = replace(
+        shift,
+        contacts=tuple(
+            replace(c, edge=0) if c.surface == foot.surface else c for c in shift.contacts
+        ),
+    )
+    assert straightened(ik, settle, rolled) is None
 
 
 def test_at_is_clipped_to_the_ends(demo_plan):
@@ -229,6 +269,12 @@ def test_holding_torques_and_forces_in_the_cones_balance_gravity(
         assert joints < 1e-2
 
 
+def handed_over_torques(kin, phase) -> np.ndarray:
+    """(n, na) at rest in each posture of a phase, load handed over evenly."""
+    contacts, prices = handed_over(phase, np.linspace(0.0, 1.0, len(phase.q)))
+    return holding_torques(kin, phase.q, contacts, prices)
+
+
 def test_feed_forward_balances_gravity_all_the_while_load_is_handed_over(
     demo_plan, demo_kinematics
 ):
@@ -238,9 +284,8 @@ def test_feed_forward_balances_gravity_all_the_while_load_is_handed_over(
             both = {
                 (c.surface, c.edge): c for c in (*phase.load_before, *phase.load_after)
             }
-            for q, tau in zip(
-                phase.q, phase_torques(demo_kinematics, phase), strict=True
-            ):
+            taus = handed_over_torques(demo_kinematics, phase)
+            for q, tau in zip(phase.q, taus, strict=True):
                 base, joints = unbalanced(demo_kinematics, q, tuple(both.values()), tau)
                 assert base < 5e-2  # [N, N m] of 300 N
                 assert joints < 5e-2
@@ -261,10 +306,9 @@ def test_a_contact_that_leaves_bears_less_and_less(demo_kinematics, knee_phases)
         kin = demo_kinematics
         kin.update(shift.q[0])  # the same posture: only the price differs
         points = contact_points(kin, contacts)
-        prices = point_prices(kin, contacts, price)
-        assert len(prices) == len(points.points)
+        prices = [price[[c.surface for c in contacts].index(n)] for n in points.names]
         load = Load(com=kin.com.copy(), mass=kin.world.mass)
-        f = contact_forces(points, load, price=prices).forces
+        f = contact_forces(points, load, price=np.array(prices)).forces
         mine = [n == "LFoot" for n in points.names]
         shares.append(float(f[mine, 2].sum()))
     assert np.all(np.diff(shares[:-1]) <= 1e-6)
@@ -278,7 +322,7 @@ def test_feed_forward_hands_the_load_over_from_old_to_new_contacts(
     shift, swing, settle = knee_phases
     kin = demo_kinematics
     for phase in knee_phases:
-        tau = phase_torques(kin, phase)
+        tau = handed_over_torques(kin, phase)
         first = holding_torque(kin, phase.q[0], phase.load_before)
         last = holding_torque(kin, phase.q[-1], phase.load_after)
         assert np.allclose(tau[0], first, atol=1e-9)
@@ -349,44 +393,3 @@ def test_a_planned_trajectory_holds_no_samples(demo_plan):
         for k in range(0, len(x), 500):
             x[k]
         assert len(x._held[1]) <= longest < len(x) / 3
-
-
-def test_no_moment_is_left_about_the_zero_moment_point(rng):
-    com = rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.8], (50, 3))
-    acceleration = rng.normal(0.0, 2.0, (50, 3))
-    z = 0.1
-    p = zero_moment_point(com, acceleration, z)
-    arm = com - np.column_stack([p, np.full(50, z)])
-    moment = np.cross(arm, acceleration + np.array([0.0, 0.0, GRAVITY]))
-    assert np.abs(moment[:, :2]).max() < 1e-9
-
-
-def lowest_dynamic_margin(kin, world, phases, speed: float) -> float:
-    """Least margin of the zero-moment point, from the sampled motion alone [m]."""
-    worst = np.inf
-    for phase in phases:
-        motion = build_trajectory(world, [phase], speed=speed)
-        com = []
-        for q in motion.q[::10]:
-            kin.update(q)
-            com.append(kin.com.copy())
-        com = np.array(com)
-        acceleration = (com[2:] - 2 * com[1:-1] + com[:-2]) * (RATE / 10) ** 2
-        kin.update(phase.q[-1])
-        points = contact_points(kin, phase.contacts).points
-        polygon = support_polygon(points[:, :2])
-        p = zero_moment_point(com[1:-1], acceleration, points[:, 2].min())
-        worst = min(worst, min(com_margin(x, polygon) for x in p))
-    return worst
-
-
-def test_a_fast_motion_is_slowed_down_until_inertia_leaves_it_balanced(
-    demo_plan, demo_kinematics, monkeypatch
-):
-    first = demo_plan.changes[0].phases  # standing: nothing but the feet
-    world = demo_plan.world
-    margin = lowest_dynamic_margin(demo_kinematics, world, first, 2.0)
-    assert margin > 0.0
-    unlimited = "clamber.planning.trajectory._balanced_cruise"
-    monkeypatch.setattr(unlimited, lambda kin, phase, spline, cruise: cruise)
-    assert lowest_dynamic_margin(demo_kinematics, world, first, 2.0) < -0.01 < margin

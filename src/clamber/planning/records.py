@@ -41,7 +41,7 @@ class PlanOptions:
     """
 
     method: Method = "direct"
-    speed: float | Literal["max"] = 0.3
+    speed: float | Literal["max"] = 1.0
     max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 

@@ -52,6 +52,8 @@ class Course:
         q: (n, nq) in their middles.
         slope: (n, nv) dq/ds on the manifold.
         bend: (n, nv) its derivative, d2q/ds2.
+        steep, sharp: (n,) the largest of both, of any joint anywhere in the interval;
+            base translation scaled.
         stance: (n,) of `stances`, which contacts may bear.
         stances: By number.
         makes: (n,) of `made`, the contact to be made soon, gently; -1 for none.
@@ -62,6 +64,8 @@ class Course:
     q: np.ndarray
     slope: np.ndarray
     bend: np.ndarray
+    steep: np.ndarray
+    sharp: np.ndarray
     stance: np.ndarray
     stances: Sequence[Sequence[Contact]]
     makes: np.ndarray
@@ -105,12 +109,7 @@ def fastest(
     """
     w = kin.world
     v = JOINT_SPEED if speed == "max" else speed
-    scaled = np.abs(course.slope)
-    scaled[:, :3] /= BASE_LENGTH
-    steep = np.maximum(scaled.max(axis=1), _FLAT)
-    bent = np.abs(course.bend)
-    bent[:, :3] /= BASE_LENGTH
-    bend = np.maximum(bent.max(axis=1), _FLAT)
+    steep, bend = (np.maximum(x, _FLAT) for x in (course.steep, course.sharp))
     x_max = np.minimum((v / steep) ** 2, QUICKNESS * v / bend)
     for i in np.flatnonzero(course.makes >= 0):
         x_max[i] = min(x_max[i], _gentle(kin, course, i))
@@ -131,6 +130,13 @@ def fastest(
         ),
         w.model.dof_damping,
         INERTIA_SHARE,
+    )
+
+
+def largest(x: np.ndarray) -> np.ndarray:
+    """(n,) of tangent vectors (n, nv): of any joint, base translation scaled."""
+    return np.maximum(
+        np.abs(x[:, 3:]).max(axis=1), np.abs(x[:, :3]).max(axis=1) / BASE_LENGTH
     )
 
 

@@ -13,6 +13,7 @@ those of leaving contacts ever dearer, and are interpolated along the spline.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,6 +39,7 @@ from clamber.planning.timing import (
     Speed,
     fastest,
     inertia_along,
+    largest,
     sample_law,
 )
 from clamber.step.change import Change
@@ -323,15 +325,25 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
         spline = spline_through(s, postures, ends, middle, np.zeros((0, 0)))
         edges.append(starts[i] + edge[1:])
         middles.append(middle)
-        looked.append((*spline.along(middle), _bend(spline.curve, middle)))
+        at, slope, bend = *spline.along(middle), _bend(spline.curve, middle)
+        most = [
+            np.maximum(largest(x), np.maximum(ends[1:], ends[:-1]))
+            for x, ends in (
+                (slope, largest(spline.along(edge)[1])),
+                (bend, largest(_bend(spline.curve, edge))),
+            )
+        ]
+        looked.append((at, slope, bend, *most))
         soon = (made[i] is not None) & (middle > 0.5 * s[-1])
         makes.append(np.where(soon, i, -1))
-    q, slope, bend = (np.concatenate(x) for x in zip(*looked, strict=True))
+    q, slope, bend, steep, sharp = map(np.concatenate, zip(*looked, strict=True))
     course = Course(
         s=np.concatenate([[0.0], *edges]),
         q=q,
         slope=slope,
         bend=bend,
+        steep=steep,
+        sharp=sharp,
         stance=np.repeat(np.arange(len(phases)), [len(m) for m in middles]),
         stances=[p.contacts for p in phases],
         makes=np.concatenate(makes),
@@ -346,19 +358,26 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
     each = np.arange(len(phases) - 1)
     cuts = np.searchsorted(law[0], starts[1:-1], side="right") - each
     timings = np.split(law, np.maximum.accumulate(np.maximum(cuts, 1)) + each, axis=1)
-    out, row = [], 0
-    for i, (phase, (s, postures, ends), grid) in enumerate(
-        zip(phases, path, middles, strict=True)
-    ):
+    taus, out, row = [], [], 0
+    for phase, grid, (s, *_) in zip(phases, middles, path, strict=True):
         rows = slice(row, row + len(grid))
         row += len(grid)
         contacts, prices = handed_over(phase, grid / s[-1])
-        tau = holding_torques(kin, q[rows], contacts, prices, forces[rows])
-        spline = spline_through(s, postures, ends, grid, tau)
+        taus.append(holding_torques(kin, q[rows], contacts, prices, forces[rows]))
+    # Where phases join, what lies between both sides: torques have no steps.
+    joints = [
+        holding_torque(kin, phases[0].q[0], phases[0].load_before),
+        *(0.5 * (a[-1] + b[0]) for a, b in itertools.pairwise(taus)),
+        holding_torque(kin, phases[-1].q[-1], phases[-1].load_after),
+    ]
+    for i, (s, postures, ends) in enumerate(path):
+        grid = np.concatenate([[0.0], middles[i], s[-1:]])
+        tau = np.stack([joints[i], *taus[i], joints[i + 1]])
         timing = timings[i].copy()
         timing[0] -= starts[i]
         lead = 0 if i else round(HOLD_START * RATE)
         rest = round(HOLD_END * RATE) if i == len(phases) - 1 else 0
+        spline = spline_through(s, postures, ends, grid, tau)
         out.append(Run(spline, timing, lead, rest))
     return out
 
