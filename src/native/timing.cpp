@@ -9,6 +9,7 @@ namespace {
 
 constexpr double RANK = 1e-4;  // of a regularisation against a direction of length one
 constexpr int CONE_EDGES = 4;
+constexpr double LEAST = 1e-4;  // of an x that is always borne
 
 }  // namespace
 
@@ -97,6 +98,7 @@ void TimeLaw::fastest(const Course& course,
         A_[(m_ - n_ - 1) * n_] = way * 2.0 * course.length[i] * course.u_max[i] / course.x_max[i];
         upper_[m_ - 1] = upper / course.x_max[i];
         lower_[m_ - 1] = lower / course.x_max[i];
+        sense_[m_ - 1] = lower == upper ? EQUALITY : INEQUALITY;
     };
     // From how fast an interval can be begun so that rest can be reached at the end. So
     // slow that |u| / u_slow + x / x_slow <= 1, inertia is nothing, whatever is left.
@@ -123,11 +125,14 @@ void TimeLaw::fastest(const Course& course,
         bool solved = solve(1.0, 0.0) && solver_.x()[0] >= 0.0;
         if (!solved) {  // slower at the end
             upper_[1] = lower_[1] = std::min(x[i] / course.x_max[i], 1.0);
-            other(i, 1, 0.0, most[i + 1]);
+            sense_[1] = EQUALITY;
+            other(i, 1, 0.0, std::min(most[i + 1], x[i]));
             solved = solve(1.0, 0.0);
         }
         if (solved) u = std::max(slow, solver_.x()[0] * course.u_max[i]);
-        x[i + 1] = std::min(std::max(x[i] + 2.0 * course.length[i] * u, 0.0), most[i + 1]);
+        // Never quite at rest on the way: it would not end.
+        const double next = std::max(x[i] + 2.0 * course.length[i] * u, LEAST * course.x_slow[i]);
+        x[i + 1] = std::min(next, most[i + 1]);
     }
 }
 

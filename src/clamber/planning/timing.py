@@ -37,7 +37,7 @@ INERTIA_SHARE = 0.6  # of what is left between rest and the border of what can b
 # nothing, and where not even rest is within the limits the robot moves like this.
 SLOW, SLOWLY = 0.3, 2.0
 TOUCH_SPEED = 0.08  # [m/s] along the normal, near a contact to be made
-TOUCH_ZONE = 0.012  # [m] what is near
+TOUCH_ZONE = 0.02  # [m] what is near, in the middle of an interval
 SMOOTHING = 0.06  # [s] width of the kernel that rounds the acceleration's corners
 STEP = 0.001  # [s]
 _FLAT = 1e-3  # a path is no flatter than this: where nothing moves, nothing is limited

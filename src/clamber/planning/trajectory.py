@@ -51,6 +51,7 @@ HOLD_START = 0.3  # [s]
 HOLD_END = 2.0  # [s] the last posture is held
 LEAST_SHARE = 1e-3  # of its load: a contact that has less bears none
 INTERVAL = 0.06  # [rad] of a path, at most; two of them between two postures, at least
+_SHARES = np.linspace(0.0, 1.0, 5)  # of an interval, where its limits are looked at
 STEEPER = 2.0  # times the slower side: a tangent there, or the spline swings over
 
 
@@ -325,15 +326,12 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
         spline = spline_through(s, postures, ends, middle, np.zeros((0, 0)))
         edges.append(starts[i] + edge[1:])
         middles.append(middle)
-        at, slope, bend = *spline.along(middle), _bend(spline.curve, middle)
+        fine = (edge[:-1, None] + np.diff(edge)[:, None] * _SHARES).ravel()
         most = [
-            np.maximum(largest(x), np.maximum(ends[1:], ends[:-1]))
-            for x, ends in (
-                (slope, largest(spline.along(edge)[1])),
-                (bend, largest(_bend(spline.curve, edge))),
-            )
+            largest(x).reshape(-1, len(_SHARES)).max(axis=1)
+            for x in (spline.along(fine)[1], _bend(spline.curve, fine))
         ]
-        looked.append((at, slope, bend, *most))
+        looked.append((*spline.along(middle), _bend(spline.curve, middle), *most))
         soon = (made[i] is not None) & (middle > 0.5 * s[-1])
         makes.append(np.where(soon, i, -1))
     q, slope, bend, steep, sharp = map(np.concatenate, zip(*looked, strict=True))
