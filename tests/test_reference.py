@@ -144,7 +144,8 @@ def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
     numeric = (joints[2:] - joints[:-2]) / (2 * PHYSICS_STEP)
     assert np.allclose(v[1:-1], numeric, atol=0.02)
     late = len(q) - (n + 20)  # of a start from rest
-    left = [kin.difference(a, b) for a, b in zip(t.q[i + 1 : i + n + 21], q[late:], strict=True)]
+    there = t.q[i + 1 : i + n + 21]
+    left = [kin.difference(a, b) for a, b in zip(there, q[late:], strict=True)]
     assert np.abs(left[-19:]).max() < 1e-9
 
 

@@ -73,7 +73,7 @@ def test_a_speed_limit_makes_it_a_trapezium(demo_plan, demo_kinematics):
 
 
 def most_borne(kin, key, push: np.ndarray) -> float:
-    """Largest u for which contacts and joints bear gravity and u times a force: an LP."""
+    """Largest u for which gravity and u times a force are borne: an LP."""
     points, _, torque = statics_at(kin, key.q, key.stance)
     cones = cone_generators(points.normals, points.mu, 4)
     J = torque.jacobian.reshape(len(cones), 3, -1)
@@ -93,9 +93,7 @@ def most_borne(kin, key, push: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])
-def test_what_contacts_and_joints_bear_limits_it(
-    demo_plan, demo_kinematics, share
-):
+def test_what_contacts_and_joints_bear_limits_it(demo_plan, demo_kinematics, share):
     """Standing, where all that moves is a force that is borne forwards so far."""
     kin, key = demo_kinematics, demo_plan.keyframes[0]
     push = np.zeros(kin.world.model.nv)
@@ -245,7 +243,7 @@ def test_the_robot_moves_on_while_contacts_change(demo_plan):
     t = timed(demo_plan.world, demo_plan.changes, "max")
     assert t is not None
     speed = np.abs(np.asarray(t.v)).max(axis=1)
-    a, b = round((HOLD_START + 0.1) * RATE), len(t.time) - round((HOLD_END + 0.1) * RATE)
+    a, b = (round((x + 0.1) * RATE) for x in (HOLD_START, t.time[-1] - HOLD_END - 0.2))
     assert speed[a:b].min() > 0.005
     apart = (
         build_trajectory(demo_plan.world, change.phases, speed="max")

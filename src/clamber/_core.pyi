@@ -493,7 +493,7 @@ class Workspace:
 
     def time_law(
         self,
-        contacts: Sequence[tuple[np.ndarray, np.ndarray]],
+        contacts: list[tuple[np.ndarray, np.ndarray]],
         stance: np.ndarray,
         q: np.ndarray,
         slope: np.ndarray,

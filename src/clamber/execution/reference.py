@@ -198,11 +198,14 @@ class Reference:
         ahead = self._ahead(at if plays else np.full(len(q), self.i))
         self._begin_rows(q, velocity, torque, closed, ahead, at, len(q))
 
-    def _load_at(self, i: int, to: int, *, up: bool = False, down: bool = False) -> None:
+    def _load_at(
+        self, i: int, to: int, *, up: bool = False, down: bool = False
+    ) -> None:
         """Follow the trajectory at hand between two samples, slower at its ends.
 
         Args:
-            i, to: From this sample to that one.
+            i: From this sample.
+            to: The last one.
             up: From rest.
             down: To rest.
         """

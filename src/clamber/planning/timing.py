@@ -141,7 +141,7 @@ def largest(x: np.ndarray) -> np.ndarray:
 
 
 def _gentle(kin: Kinematics, course: Course, i: int) -> float:
-    """Bound of x at a point near a contact to be made, infinite where it is not near."""
+    """Bound of x near a contact to be made, infinite where it is not near."""
     c = course.made[course.makes[i]]
     n = kin.world.supports[c.support].normal
     kin.update(course.q[i])

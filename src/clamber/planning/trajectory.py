@@ -29,7 +29,6 @@ from clamber.planning.samples import (
     RATE,
     Run,
     Samples,
-    Spline,
     sampled,
     spline_through,
 )
@@ -223,13 +222,12 @@ def _tangent(
 
     Args:
         kin: Workspace.
-        before, after: (2, nq) the last postures of the one, the first of the other.
+        before: (2, nq) the last postures of the one.
+        after: (2, nq) the first of the other.
         steps: Of the path parameter between them.
         closed: By surface.
     """
-    a, b = (
-        kin.difference(*q) / h for q, h in zip((before, after), steps, strict=True)
-    )
+    a, b = (kin.difference(*q) / h for q, h in zip((before, after), steps, strict=True))
     ha, hb = steps
     mean = (hb * a + ha * b) / (ha + hb)
     most = STEEPER * np.minimum(np.abs(a), np.abs(b)) * (a * b > 0)
@@ -403,7 +401,8 @@ def timed(
     ik = IK(world)
     for i in range(len(lead), len(phases) - 1):
         if (phases[i].kind, phases[i + 1].kind) == ("settle", "shift"):
-            phases[i : i + 2] = straightened(ik, *phases[i : i + 2]) or phases[i : i + 2]
+            both = phases[i : i + 2]
+            phases[i : i + 2] = straightened(ik, *both) or both
     ends = np.cumsum([len(lead), *(len(change.phases) for change in changes)])
     return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
 
