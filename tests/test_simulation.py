@@ -29,7 +29,9 @@ from clamber.execution.verdict import (
     TILT_TOL,
     UNINTENDED_TOL,
     YAW_TOL,
+    Criterion,
     Figure,
+    Verdict,
     judge,
     measure,
     self_penetration,
@@ -467,6 +469,37 @@ def test_a_box_that_is_not_there_is_no_crash_of_the_judge(start_only):
     nothing = Scene(start=np.zeros(3))
     rollout = simulate(start_only, controller="pid", true_scene=nothing)
     assert not judge(start_only, rollout).reached
+
+
+def test_a_verdict_is_shown_in_percent_millimetres_and_degrees() -> None:
+    figures = {
+        Figure.UPRIGHT: (1.0, 1.0, "did not fall", "yes", "yes"),
+        Figure.WENT_ON: (0.0, 1.0, "did not stop on the way", "no", "yes"),
+        Figure.UNINTENDED: (
+            0.0123, 0.01, "load on non-contact links", "1.2 %", "1.0 %"
+        ),
+        Figure.PENETRATION: (
+            0.00026, 0.01, "deepest penetration of the scene", "0.3 mm", "10.0 mm"
+        ),
+        Figure.END_SPEED: (
+            0.002, 0.05, "pelvis speed at the end", "2.0 mm/s", "50.0 mm/s"
+        ),
+        Figure.TILT: (
+            np.pi / 36, np.pi / 9, "pelvis tilt error at the end", "5.0 deg", "20.0 deg"
+        ),
+    }  # fmt: skip
+    criteria = {
+        f: Criterion(value=row[0], limit=row[1], ok=f is not Figure.UNINTENDED)
+        for f, row in figures.items()
+    }
+    verdict = Verdict(reached=False, criteria=criteria)
+    shown = [row[2:] for row in figures.values()]
+    assert [row[:3] for row in verdict.rows()] == shown
+    assert [row[3] for row in verdict.rows()] == [c.ok for c in criteria.values()]
+    assert verdict.failed() == "load on non-contact links"
+    for figure in Figure:  # none has a unit that nobody knows
+        assert figure.in_words(0.0)
+        assert "[" not in figure.label
 
 
 def test_who_ends_on_the_feet_alone_must_stand(demo_plan, demo_rollout, figures):

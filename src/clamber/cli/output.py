@@ -305,8 +305,8 @@ def conclude(
     table = new_table("criterion", "value", "limit", "")
     rollout, verdict = (None, None) if done is None else done
     criteria = {} if verdict is None else verdict.criteria
-    for name, c in criteria.items():
-        table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
+    for *row, ok in [] if verdict is None else verdict.rows():
+        table.add_row(*row, "ok" if ok else "NO")
     reached = verdict is not None and verdict.reached
     planned = plan_record(plan, clock)
     record = {
@@ -327,8 +327,8 @@ def conclude(
     elif rollout is not None and rollout.stopped:
         note = f"failed: stopped during execution: {rollout.stopped}"
     else:
-        wrong = [n for n, c in criteria.items() if not c.ok]
-        note = f"failed: {', '.join(wrong) or 'nothing was planned'}"
+        wrong = "" if verdict is None else verdict.failed()
+        note = f"failed: not met: {wrong}" if wrong else "failed: nothing was planned"
     tables = keyframe_tables(planned) if clock is not None else []
     tables += skipped_tables(plan)
     if rollout is not None and rollout.events:

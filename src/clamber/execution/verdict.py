@@ -33,6 +33,12 @@ ABOVE_SUPPORT = 0.05  # [m] pelvis at the end
 PENETRATION_TOL = 0.010  # [m] of the robot into itself or into the scene
 GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
 YAW_TOL = np.radians(15.0)
+SHOWN = {  # for people: the unit of a figure, and how many of another one it is
+    "": (100.0, "%"),
+    "m": (1000.0, "mm"),
+    "m/s": (1000.0, "mm/s"),
+    "rad": (float(np.degrees(1.0)), "deg"),
+}
 EVERY = 5  # recorded states between two looks for self-penetration
 
 
@@ -55,6 +61,18 @@ class Figure(StrEnum):
     ABOVE_SUPPORT = "pelvis above its support at the end [m]"
     GOAL = "pelvis to the goal [m]"
     YAW = "yaw error at the goal [rad]"
+
+    @property
+    def label(self) -> str:
+        """Without the unit."""
+        return self.value.partition(" [")[0]
+
+    def in_words(self, value: float) -> str:
+        """A value for people: yes or no, percent, millimetres or degrees."""
+        if self in (Figure.UPRIGHT, Figure.WENT_ON, Figure.COMPLETE):
+            return "yes" if value else "no"
+        factor, unit = SHOWN[self.value.partition(" [")[2].removesuffix("]")]
+        return f"{factor * value:.1f} {unit}"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -85,6 +103,17 @@ class Verdict(Shown):
     criteria: dict[Figure, Criterion]
 
     __repr__ = short_repr
+
+    def rows(self) -> list[tuple[str, str, str, bool]]:
+        """For people: each criterion's label, value, limit, and whether it is met."""
+        return [
+            (f.label, f.in_words(c.value), f.in_words(c.limit), c.ok)
+            for f, c in self.criteria.items()
+        ]
+
+    def failed(self) -> str:
+        """Labels of the criteria that are not met, between commas."""
+        return ", ".join(f.label for f, c in self.criteria.items() if not c.ok)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

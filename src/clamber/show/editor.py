@@ -397,10 +397,9 @@ class Editor:
         verdict = judge(self._new, rollout)
         self._done = (rollout, verdict)
         self._replaced(self._new, rollout)
-        failed = [n for n, c in verdict.criteria.items() if not c.ok]
         if verdict.reached:
             return "Physics: success."
-        return f"Physics: failed ({', '.join(failed)})."
+        return f"Physics: failed; not met: {verdict.failed()}."
 
     def _save(self) -> str:
         assert self._new is not None

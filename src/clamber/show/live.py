@@ -6,7 +6,7 @@ What is only read (plots, tables, criteria) is in the report, which the page han
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Verdict
 from clamber.model.arguments import checks_types
 from clamber.model.terrain import SceneLike
 from clamber.planning.records import Plan
@@ -175,20 +176,17 @@ def _show_recording(page: Page, skeleton: Skeleton) -> None:
     page.span(float(demo.t[0]), float(demo.t[-1]), skeleton.changes())
 
 
-def _add_verdict(page: Page, verdict: Mapping[str, Any]) -> None:
-    """Whether the robot got there, and each criterion: fields of `verdict.json`."""
-    reached, gui = bool(verdict.get("reached")), page.server.gui
-    colour = "#16a34a" if reached else "#dc2626"
-    said = "reached the goal" if reached else "did not make it"
+def _add_verdict(page: Page, verdict: Verdict) -> None:
+    """Whether the robot got there, and each criterion."""
+    gui = page.server.gui
+    colour = "#16a34a" if verdict.reached else "#dc2626"
+    said = "reached the goal" if verdict.reached else "failed"
     gui.add_html(
         f'<p style="margin: 4px 12px; font-weight: 600; color: {colour}">{said}</p>'
     )
     rows = (
-        (
-            name if c["ok"] else f"{name}: NOT MET",
-            f"{c['value']:.4g} / {c['limit']:.4g}",
-        )
-        for name, c in verdict.get("criteria", {}).items()
+        (label if ok else f"{label}: NOT MET", f"{value} / {limit}")
+        for label, value, limit, ok in verdict.rows()
     )
     with gui.add_folder("Verdict: value / limit", expand_by_default=False):
         gui.add_html(rows_of(rows))

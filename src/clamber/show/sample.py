@@ -20,6 +20,7 @@ from clamber.contact.contact import Contact
 from clamber.contact.steps import Step
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Verdict
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.scene import Support
@@ -40,6 +41,7 @@ from clamber.run.folder import (
     load_fields,
     load_plan,
     load_rollout,
+    load_verdict,
 )
 from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import Keyframe
@@ -68,19 +70,19 @@ class Run:
     Attributes:
         folder: The run folder.
         missing: A sentence for each thing that could not be read.
-        written, execution, verdict, timings: Fields of the JSON files; empty where they
-            are missing.
-        plan, rollout: None where their files are.
+        written, execution, timings: Fields of the JSON files; empty where they are
+            missing.
+        plan, rollout, verdict: None where their files are.
     """
 
     folder: Path
     missing: list[str] = field(default_factory=list)
     written: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)
-    verdict: Mapping[str, Any] = field(default_factory=dict)
     timings: Mapping[str, Any] = field(default_factory=dict)
     plan: Plan | None = None
     rollout: Rollout | None = None
+    verdict: Verdict | None = None
 
     __repr__ = short_repr
 
@@ -129,7 +131,7 @@ def read_run(folder: Path) -> Run:
     if ran or run.has(EXECUTION):
         run.execution = run.fields(EXECUTION)
     if ran or run.has(VERDICT):
-        run.verdict = run.fields(VERDICT)
+        run.verdict = run.attempt(lambda: load_verdict(folder))
     run.timings = run.fields(TIMINGS)
     if run.written and not ran:
         text = "the plan has not been run in physics"

@@ -222,7 +222,7 @@ function section(title, className, make, note) {
 }
 
 function heading(run, motion) {
-  const badge = run.reached === null ? ["plan only", "open"] : run.reached ? ["reached the goal", "good"] : ["did not make it", "bad"];
+  const badge = run.reached === null ? ["plan only", "open"] : run.reached ? ["reached the goal", "good"] : ["failed", "bad"];
   const facts = [];
   if (motion && !motion.stills) facts.push(`${fixed(motion.end, 1)} s`);
   if (run.keyframes.length) facts.push(`${run.keyframes.length} stances`);
@@ -489,7 +489,7 @@ function stances(run) {
 
 function verdict(run) {
   if (!run.criteria) return el("p", { class: "note" }, "Not judged: no verdict.");
-  return table(["criterion", "value", "limit", ""], run.criteria.map((c) => el("tr", { class: c.ok ? "" : "failed" }, cells([c.name, c.value, c.limit, c.ok ? "ok" : "NO"]))), "verdict");
+  return table(["criterion", "value", "limit", ""], run.criteria.map(([label, value, limit, ok]) => el("tr", { class: ok ? "" : "failed" }, cells([label, value, limit, ok ? "ok" : "NO"]))), "verdict");
 }
 function events(run, motion) {
   if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Every contact was measured where it was planned.");
