@@ -207,7 +207,6 @@ class _RunPage:
         self._page, self._plan, self._rollout = page, plan, run.rollout
         self._layers = dict(LAYERS)
         self._stage = self._first = Stage(page.server, plan, run.rollout, "/run")
-        self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
         self._count, self._figure, gui = 0, None, page.server.gui
         scene = self._stage.motion.world.scene
         self._points = self._stage.seen()
@@ -225,6 +224,7 @@ class _RunPage:
             person = thinned(skeleton.position, 60).reshape(-1, 3)
             offset = to_the_right(scene, self._points, skeleton.demo.scene, person)
             self._figure = Figure(page.server, skeleton, offset)
+        self._pair(plan)
         self._look()
         page.follow(lambda t: self._stage.base(t))
         with page.layers:
@@ -256,13 +256,19 @@ class _RunPage:
                 server = self._page.server
                 self._stage = Stage(server, plan, rollout, name, before=self._first)
             self._plan_shown, self._rollout_shown = plan, rollout
-            self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
+            self._pair(plan)
             self._first.root.visible = self._stage is self._first
             if before is not self._first:
                 before.root.remove()
             # First: what is sent to a plot just before it goes, the browser misses.
             self._chart.renew()
             self._span()
+
+    def _pair(self, plan: Plan) -> None:
+        """Have the person keep time with the robot."""
+        if self._figure is not None:
+            stage, person = self._stage, self._figure.skeleton
+            self._paired = paired_times(plan, stage.reached, stage.duration, person)
 
     def _span(self) -> None:
         """As long as the longest of what is shown; the contacts of the first."""

@@ -319,7 +319,7 @@ class Figure:
             skeleton: The recording.
             offset: (3,) where its world is put [m].
         """
-        add, self._skeleton, self._offset = server.scene, skeleton, offset
+        add, self.skeleton, self._offset = server.scene, skeleton, offset
         self.root = add.add_frame("/person", show_axes=False, position=offset)
         for i, box in enumerate(skeleton.demo.scene.boxes):
             add.add_box(
@@ -338,11 +338,11 @@ class Figure:
 
     def seen(self) -> np.ndarray:
         """(n, 3) points that a camera has to have in view [m]."""
-        return thinned(self._skeleton.position, 60).reshape(-1, 3) + self._offset
+        return thinned(self.skeleton.position, 60).reshape(-1, 3) + self._offset
 
     def show(self, t: float) -> str:
         """Put the person where it is; bones that were not seen are not shown."""
-        skeleton = self._skeleton
+        skeleton = self.skeleton
         p, seen = skeleton.at(t)
         bones = skeleton.bones[seen[skeleton.bones].all(axis=1)]
         self._bones.visible = len(bones) > 0
