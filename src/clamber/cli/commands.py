@@ -50,9 +50,8 @@ from clamber.cli.output import (
     replanned_record,
     skipped_tables,
 )
-from clamber.cli.progress import Report, Track
+from clamber.cli.progress import Report
 from clamber.cli.tools import (
-    DRAWING,
     ExportCommand,
     RenderCommand,
     ReportCommand,
@@ -62,6 +61,7 @@ from clamber.cli.tools import (
     ViewCommand,
 )
 from clamber.errors import ClamberError, InputError
+from clamber.show.track import DRAWING, EXECUTION, PLANNING, Track
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -463,9 +463,6 @@ COMMANDS = {
     "robot": RobotCommand,
     "sweep": SweepCommand,
 }
-
-
-PLANNING, EXECUTION = ("plan", "trajectory", "save"), ("simulate", "save run")
 
 
 def _drawing(video: bool) -> tuple[str, ...]:

@@ -21,8 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 import clamber
-from clamber.cli.progress import Report, Track, bar, lines
+from clamber.cli.progress import Report, bar, lines
 from clamber.execution.events import event_fields
+from clamber.show.track import Track
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: success (or the command did its work), failure, bad

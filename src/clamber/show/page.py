@@ -21,6 +21,7 @@ import numpy as np
 
 from clamber.errors import ClamberError, InputError
 from clamber.show.renderer import PRESETS, Preset, View, frame_view
+from clamber.show.track import Track
 
 FRAMES_A_SECOND = 30
 PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
@@ -369,16 +370,20 @@ class Work:
         """Whether something is being done."""
         return self._busy.locked()
 
-    def do(self, job: Callable[[], str]) -> str:
+    def do(self, job: Callable[[], str], *stages: str) -> str:
         """Do it, unless something is being done; what goes wrong is said, not thrown.
 
         Args:
             job: Returns what is to be said in the end.
+            stages: Of it, in order, which it reports; none of what is done at once.
         """
         if not self._busy.acquire(blocking=False):
             return ""
         self._changed()
+        self._track = Track(*stages)
         try:
+            if stages:
+                self.report(stages[0], 0.0, "")
             said = job()
         except (ClamberError, OSError) as e:
             said = str(e)
@@ -390,9 +395,11 @@ class Work:
 
     def report(self, stage: str, share: float, note: str) -> None:
         """How far it is: a stage, its share, and what is at hand."""
+        self._track.update(stage, share)
         self._bar.visible = True
-        self._bar.value = 100.0 * min(max(share, 0.0), 1.0)
-        self.say(f"{stage}: {note}" if note else stage)
+        self._bar.value = 100.0 * self._track.share
+        left = f" ({self._track})" if str(self._track) else ""
+        self.say((f"{stage}: {note}" if note else stage) + left)
 
     def say(self, *texts: str) -> None:
         """Have these lines there, in place of those before."""

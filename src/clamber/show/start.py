@@ -30,6 +30,7 @@ from clamber.show.meshes import body_meshes, body_poses
 from clamber.show.page import Page, Work, paragraphs
 from clamber.show.renderer import robot_corners
 from clamber.show.scene3d import DEVIATION, PERSON_BOX, TRIANGLES, Bodies
+from clamber.show.track import EXECUTION, PLANNING
 from clamber.study.climb import Climb, ClimbResult, command_of, run_climb
 
 UPLOADS = Path("runs") / "uploads"
@@ -242,7 +243,7 @@ class StartPage:
             made.append(folder)
             return outcome(climb, result)
 
-        said = self._work.do(job)
+        said = self._work.do(job, "detect", *PLANNING, *EXECUTION)
         if made:
             try:
                 self._opened(made[0])
