@@ -93,6 +93,29 @@ def test_what_is_tried_again_goes_on_from_where_it_was():
     assert shares[-2] < shares[-1] == 1.0
 
 
+def test_what_falls_back_a_little_goes_on_from_there_without_a_jump():
+    track, shares = Track("simulate", clock=Hands()), []
+    for done in (0.0, 0.4, 0.8, 0.78, 0.79, 0.9, 0.88, 0.94, 1.0):
+        track.update("simulate", done)
+        shares.append(track.share)
+    assert shares == sorted(shares)
+    assert shares[3] == shares[2] == pytest.approx(0.8)
+    assert shares[4] == pytest.approx(0.8 + 0.2 * 0.01 / 0.22)
+    assert max(np.diff(shares)) < 0.41
+    assert shares[-1] == pytest.approx(1.0)
+
+
+def test_a_time_left_that_was_far_too_short_is_said_no_more():
+    clock = Hands()
+    track = Track("simulate", clock=clock)
+    said = []
+    for now, done in ((1.0, 0.2), (10.0, 0.25), (20.0, 0.3), (21.0, 0.9), (22.0, 1.0)):
+        clock.now = now
+        track.update("simulate", done)
+        said.append(str(track))
+    assert said == ["0:04 left", "", "", "0:02 left", ""]
+
+
 def shown_on_a_log(reports: Sequence[tuple[str, float]], *stages: str) -> list[str]:
     log = io.StringIO()
     track = Track(*stages, clock=itertools.count(0.0, 0.1).__next__)

@@ -201,6 +201,13 @@ def test_progress_goes_from_nothing_to_all(start_only):
     assert seen == sorted(seen)
 
 
+def test_progress_is_the_share_of_the_motion_that_is_done(one_hand_plan):
+    seen = []
+    simulate(one_hand_plan, progress=lambda _, share, note: seen.append((share, note)))
+    even = np.linspace(0.0, 1.0, len(seen))
+    assert np.abs(np.array([s for s, _ in seen]) - even).max() < 0.1
+
+
 def test_a_plan_without_a_trajectory_cannot_be_simulated(demo_plan):
     with pytest.raises(ValueError, match="no trajectory"):
         simulate(replace(demo_plan, trajectory=None))

@@ -203,10 +203,15 @@ class Executive:
     @property
     def left(self) -> int:
         """Physics steps to the end, as far as is known."""
+        ref = self._ref
         if self.core.ends:
-            return self._ref.track.left
-        assert self._plan.trajectory is not None
-        return len(self._plan.trajectory.time)
+            return ref.track.left
+        ahead = len(ref.trajectory.time) - ref.i
+        if self._at_hand.goes_on:  # farther than this part of it
+            assert self._plan.trajectory is not None
+            whole = len(self._plan.trajectory.time)
+            ahead = max(ahead, whole - len(self.core.commanded))
+        return ahead
 
     @property
     def rests_on(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ COSTS = {
 }
 PLANNING, EXECUTION = ("plan", "trajectory", "save"), ("simulate", "save run")
 DRAWING = ("pictures", "video")
+MISJUDGED = 1.5  # so many times what was said of the time left is no longer said
 EARLY = 0.1  # share before which nothing can be said of the time left
 
 
@@ -47,26 +48,30 @@ class Track:
         self.stages: Sequence[str] = stages
         self._widths = [c / sum(costs) for c in costs]
         self._clock, self._began = clock, clock()
-        self._at, self._base, self._inside = 0, 0.0, 0.0
+        self._at, self._inside, self._done = 0, 0.0, 0.0
+        self._base, self._from = 0.0, 0.0
         self.share = 0.0
         self.left: float | None = None
+        self._believed = False
 
     def update(self, stage: str, done: float) -> None:
         """Take in a report.
 
-        A stage that begins anew, or one that is not in the list, such as the search for
-        other contacts in the planning, does what is left of the stage it is in.
+        A stage that falls back or begins anew, or one that is not in the list, such as
+        the search for other contacts in the planning, does what is left of the stage.
         """
         at = self.stages.index(stage) if stage in self.stages else self._at
         if at > self._at:
-            self._at, self._base, self._inside = at, 0.0, 0.0
+            self._at, self._inside, self._done = at, 0.0, 0.0
+            self._base, self._from = 0.0, 0.0
         elif at < self._at:
             return
-        inside = self._base + (1.0 - self._base) * done
-        if inside < self._inside:
-            self._base = self._inside
-            inside = self._base + (1.0 - self._base) * done
-        self._inside = min(inside, 1.0)
+        if done < self._done:
+            self._base, self._from = self._inside, done
+        self._done = done
+        if done > self._from:
+            within = min((done - self._from) / (1.0 - self._from), 1.0)
+            self._inside = self._base + (1.0 - self._base) * within
         before = sum(self._widths[: self._at])
         share = before + self._widths[self._at] * self._inside
         self.share = min(max(self.share, share), 1.0)
@@ -77,15 +82,16 @@ class Track:
         self.share, self.left = 1.0, 0.0
 
     def _estimate(self) -> None:
-        """The time left, which is corrected downwards alone."""
+        """The time left, corrected downwards alone; not believed when far too short."""
         spent = self._clock() - self._began
         if self.share >= EARLY:
             left = spent * (1.0 - self.share) / self.share
             self.left = left if self.left is None else min(self.left, left)
+            self._believed = left < MISJUDGED * self.left + 1.0
 
     def __str__(self) -> str:
         """The time left in words; empty where nothing can be said of it."""
-        if self.left is None or self.share >= 1.0:
+        if self.left is None or not self._believed or self.share >= 1.0:
             return ""
         seconds = round(self.left)
         return f"{seconds // 60}:{seconds % 60:02d} left"
