@@ -74,6 +74,16 @@ class Figure(StrEnum):
         factor, unit = SHOWN[self.value.partition(" [")[2].removesuffix("]")]
         return f"{factor * value:.1f} {unit}"
 
+    def limit_in_words(self, limit: float) -> str:
+        """A limit for people, and whether it is the least or the most."""
+        words = self.in_words(limit)
+        return words if words == "yes" else f"at {self._bound} {words}"
+
+    @property
+    def _bound(self) -> str:
+        least = (Figure.LOAD_ON_PLAN, Figure.STANDING, Figure.LOAD_ON_OBSTACLES)
+        return "least" if self in (*least, Figure.ABOVE_SUPPORT) else "most"
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Criterion:
@@ -107,7 +117,7 @@ class Verdict(Shown):
     def rows(self) -> list[tuple[str, str, str, bool]]:
         """For people: each criterion's label, value, limit, and whether it is met."""
         return [
-            (f.label, f.in_words(c.value), f.in_words(c.limit), c.ok)
+            (f.label, f.in_words(c.value), f.limit_in_words(c.limit), c.ok)
             for f, c in self.criteria.items()
         ]
 

@@ -12,6 +12,7 @@ from clamber.show.sample import Motion, peaks, row_at
 
 MOST = 500  # samples: as many as the panel is wide [px]
 HEIGHT = 200  # [px]
+MARGIN = 0.05  # above and below the series
 FEW = 5  # joints that are named
 COLOURS = ("#2563eb", "#c2410c", "#0891b2", "#d97706", "#7c3aed", "#db2777", "#15803d")
 NOW = "#dc2626"
@@ -91,6 +92,10 @@ class Chart:
             looks.append(
                 {"label": name, "stroke": COLOURS[i % len(COLOURS)], "width": 1.5}
             )
+        # The browser would find no range among the gaps of the mark.
+        finite = lines[np.isfinite(lines)]
+        least, most = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
+        room = MARGIN * (most - least) or 1.0
         points = {"show": True, "size": 8}
         looks.append({"label": "now", "stroke": NOW, "points": points})
         if self._plot is not None:
@@ -99,7 +104,10 @@ class Chart:
             self._plot = self._page.server.gui.add_uplot(
                 (*self._data, self._mark(self._page.clock.t)),
                 tuple(looks),
-                scales={"x": {"time": False}},
+                scales={
+                    "x": {"time": False},
+                    "y": {"range": (least - room, most + room)},
+                },
                 height=HEIGHT,
             )
 

@@ -185,10 +185,10 @@ def _add_verdict(page: Page, verdict: Verdict) -> None:
         f'<p style="margin: 4px 12px; font-weight: 600; color: {colour}">{said}</p>'
     )
     rows = (
-        (label if ok else f"{label}: NOT MET", f"{value} / {limit}")
+        (label if ok else f"{label}: NOT MET", value, limit)
         for label, value, limit, ok in verdict.rows()
     )
-    with gui.add_folder("Verdict: value / limit", expand_by_default=False):
+    with gui.add_folder("Verdict: value, limit", expand_by_default=False):
         gui.add_html(rows_of(rows))
 
 
@@ -234,7 +234,7 @@ class _RunPage:
         self._chart = Chart(page, lambda: self._stage.motion)
         with gui.add_folder("Edit", expand_by_default=False):
             Editor(page, run.folder, plan, self.replace)
-        with gui.add_folder("Take away", expand_by_default=False):
+        with gui.add_folder("Export", expand_by_default=False):
             Handout(page, run.folder, lambda: (self._plan_shown, self._rollout_shown))
         self._plan_shown, self._rollout_shown = plan, run.rollout
         if others:

@@ -437,13 +437,11 @@ def paragraphs(texts: Sequence[str]) -> str:
     return f'<div style="font-size: 13px; padding: 0 12px">{lines}</div>'
 
 
-def rows_of(pairs: Iterable[tuple[str, str]]) -> str:
-    """A table of two columns as HTML; the texts are no markup."""
+def rows_of(rows: Iterable[Sequence[str]]) -> str:
+    """A table as HTML; the texts are no markup."""
     cell = '<td style="padding: 1px 12px 1px 0; vertical-align: top">'
-    rows = "".join(
-        f"<tr>{cell}{html.escape(a)}</td>{cell}{html.escape(b)}</td></tr>"
-        for a, b in pairs
-    )
+    lines = ("".join(f"{cell}{html.escape(x)}</td>" for x in row) for row in rows)
+    rows = "".join(f"<tr>{line}</tr>" for line in lines)
     return f'<table style="font-size: 13px; margin: 4px 12px">{rows}</table>'
 
 

@@ -260,7 +260,9 @@ class StartPage:
 
 def outcome(climb: Climb, result: ClimbResult) -> str:
     """How it ended, and the line that does it again."""
-    ended = "The robot got there." if result.reached else f"It did not: {result.why}."
+    ended = "Success: the robot reached the goal stance."
+    if not result.reached:
+        ended = f"Failed: {result.why}."
     return f"{ended} The same from a terminal: {command_of(climb)}"
 
 
