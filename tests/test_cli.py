@@ -26,7 +26,9 @@ import pytest
 import clamber
 from clamber import cli
 from clamber.cli import flags, output, tools
+from clamber.cli.output import closing
 from clamber.execution.verdict import Figure, judge
+from clamber.planning.records import Fallback
 from conftest import ROOT
 from support.files import write_take
 
@@ -630,3 +632,17 @@ def test_a_sweep_with_a_robot_that_is_not_there_runs_nothing(
     assert cli.main(["sweep", str(spec), "--out", str(out)]) == output.BAD_INPUT
     assert "nobody" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_success_that_is_not_as_demonstrated_ends_with_the_success(one_hand_plan):
+    fallback = Fallback(
+        reason="no stable plan as demonstrated (LHand -> air: too far)",
+        source="alternatives",
+        surfaces=("LElbow",),
+    )
+    made = replace(one_hand_plan, fallback=fallback, complete=True)
+    said = closing("success: it is there", Path("runs/x"), True, made).splitlines()
+    assert said[0].startswith("note: no stable plan as demonstrated (LHand")
+    assert said[0].endswith("instead, of the alternatives: LElbow")
+    assert said[1:] == ["success: it is there; the files are in runs/x"]
+    assert closing("done", Path("x"), True, one_hand_plan).count("\n") == 0

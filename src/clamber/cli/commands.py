@@ -185,7 +185,7 @@ class PlanCommand:
                 clamber.save_sequence(sequence, folder / "sequence.json")
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
         record = {"out": str(folder), **plan_record(plan, clock)}
-        note = closing(outcome(plan), folder, plan.complete)
+        note = closing(outcome(plan), folder, plan.complete, plan)
         self.output.show(
             record, *keyframe_tables(record), *skipped_tables(plan), note=note
         )
@@ -298,7 +298,7 @@ class ReplanCommand:
             record,
             *tables,
             *skipped_tables(plan),
-            note=closing(note, folder, plan.complete),
+            note=closing(note, folder, plan.complete, plan),
         )
         return REACHED if plan.complete else MISSED
 

@@ -243,18 +243,22 @@ def replanned_record(found: clamber.Replanned) -> dict[str, Any]:
 def outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
-        return _after_fallback(plan, "planned to the last stance")
+        return "planned to the last stance"
     return f"no plan: {plan.fallback or plan.why_not}"
 
 
-def _after_fallback(plan: clamber.Plan, note: str) -> str:
-    return note if plan.fallback is None else f"{plan.fallback}; {note}"
+def closing(
+    note: str, folder: Path, well: bool, plan: clamber.Plan | None = None
+) -> str:
+    """The last line: how it ended, where the files are, and what to look at.
 
-
-def closing(note: str, folder: Path, well: bool) -> str:
-    """The last line: how it ended, where the files are, and what to look at."""
+    Before it, where a plan is complete, what it does in place of what was asked for.
+    """
     look = "" if well else f"; `clamber report {folder}` shows how far it came"
-    return f"{note}; the files are in {folder}{look}"
+    said = f"{note}; the files are in {folder}{look}"
+    if plan is None or not plan.complete or plan.fallback is None:
+        return said
+    return f"note: {plan.fallback}\n{said}"
 
 
 def skipped_tables(plan: clamber.Plan) -> list[Table]:
@@ -322,7 +326,7 @@ def conclude(
         **planned,
     }
     if reached:
-        note = _after_fallback(plan, "success: the robot reached the goal stance")
+        note = "success: the robot reached the goal stance"
     elif not plan.complete:
         note = outcome(plan)
     elif rollout is not None and rollout.stopped:
@@ -338,5 +342,5 @@ def conclude(
             felt.add_row(f"{e.time:.2f}", str(e))
         tables.append(felt)
     tables += [table] if criteria else []
-    output.show(record, *tables, note=closing(note, folder, reached))
+    output.show(record, *tables, note=closing(note, folder, reached, plan))
     return REACHED if reached else MISSED
