@@ -407,7 +407,7 @@ MISTAKES = {
     "climb --demo unit.yaml": ("unit", "'ell'"),
     "climb --scene no.yaml": ("no.yaml: expected a readable file", "check the path"),
     "climb --scene tab.yaml": ("tab.yaml: expected YAML", "line 2"),
-    "climb --scene field.yaml": ("boxes.0.colour", "mend its name, or leave it out"),
+    "climb --scene field.yaml": ("boxes.0.colour", "correct its name, or leave it out"),
     "climb --scene inside.yaml": ("start is", "move the one or the other"),
     "climb --speed 0": ("--speed is 0.0", "expected a joint speed of at least"),
     "climb --disturb.friction 7": ("--disturb.friction is 7.0", "from 0.01 to 1"),

@@ -76,7 +76,7 @@ class ClimbCommand:
     contacts: Literal["any", "demonstrated"] = "any"
     """any: other contacts where the demonstrated ones have no stable plan."""
     search: SearchFlags = field(default_factory=SearchFlags)
-    """How far to look for contacts that nobody demonstrated."""
+    """How far to look for contacts beyond the demonstrated ones."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: Switch = False
     """Draw a video too, not pictures alone."""
@@ -213,7 +213,7 @@ class ReplanCommand:
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     search: SearchFlags = field(default_factory=SearchFlags)
-    """How far to look for contacts that nobody demonstrated."""
+    """How far to look for contacts beyond the demonstrated ones."""
     out: Place = None
     """The run folder (runs/replan, then runs/replan-2 ...)."""
     output: Printed
@@ -478,7 +478,7 @@ def _plan(
     report: Report,
     others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
-    """Plan and save; `others`: how others are looked for where the shown ones fail."""
+    """Plan and save; `others`: how alternative contacts are searched for."""
     result = clamber.plan(
         sequence,
         robot,
@@ -501,7 +501,7 @@ def _draw(
     track: Track,
     **options: Any,
 ) -> None:
-    """Pictures, which nobody need wait for."""
+    """Pictures, after the verdict has been shown."""
     missing = ()
     with output.progress(track) as show, filling(folder):
         report = clock.watching(show)

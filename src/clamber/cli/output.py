@@ -109,7 +109,7 @@ def filling(folder: Path) -> Iterator[None]:
 
 
 class Clock:
-    """Seconds by stage and by move, from what the stages report of themselves."""
+    """Seconds by stage and by contact change, from what the stages report."""
 
     def __init__(self) -> None:
         """Nothing has run yet."""
@@ -136,7 +136,7 @@ class Clock:
         return timed
 
     def _add(self, step: tuple[str, float, str], spent: float) -> None:
-        """A move that is tried again, for a later one's sake, costs both times."""
+        """A contact change that is tried again costs both times."""
         for i, (note, seconds) in enumerate(self._moves):
             if note == step[2]:
                 self._moves[i] = (note, seconds + spent)
@@ -148,7 +148,7 @@ class Clock:
         return dict(self._stages)
 
     def of(self, move: object) -> float | None:
-        """Seconds that a move took; None where it was not watched."""
+        """Seconds that a contact change took; None where it was not watched."""
         return dict(self._moves).get(str(move))
 
 
@@ -262,7 +262,7 @@ def closing(
 
 
 def skipped_tables(plan: clamber.Plan) -> list[Table]:
-    """A table of the stances left out, and of what there is no way for."""
+    """A table of the stances left out, and of the steps that could not be planned."""
     rows = [(str(s.stance), s.reason) for s in plan.skipped]
     for f in plan.failures:
         rows.append(("" if f.step is None else str(f.step.stance), str(f)))
@@ -273,7 +273,7 @@ def skipped_tables(plan: clamber.Plan) -> list[Table]:
 
 
 def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
-    """Options, and how the pelvis is held."""
+    """Options, and the distributions of the pelvis's orientation."""
     options = new_table(
         " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
         "until",

@@ -179,7 +179,7 @@ def split_steps(
 
 
 def on_feet(world: World, stance: Sequence[Contact]) -> bool:
-    """Whether a stance is one of feet alone: what ends so is meant to stand."""
+    """Whether a stance is on feet alone: a motion that ends so is meant to stand."""
     limb_of = world.robot.limb_of
     limbs = [(limb_of(c.surface), c.surface) for c in stance]
     return bool(limbs) and all(

@@ -179,7 +179,7 @@ class Executive:
         next(self._behaviour)
 
     def close(self) -> None:
-        """The run is over: its actions let go of what they hold."""
+        """The run is over: release what its actions hold."""
         self._behaviour.close()
 
     def balance(self) -> None:
@@ -398,7 +398,7 @@ class Executive:
         yield from self._replan(held, held)
 
     def _recover(self) -> Reaction:
-        """Does a contact of the stance carry nothing? Then it is probed for again."""
+        """Does a contact of the stance carry no load? Then probe to re-establish it."""
         for c in self.stance:
             if not self.estimate.is_lost(c):
                 continue

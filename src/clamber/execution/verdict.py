@@ -1,4 +1,4 @@
-"""Plan, rollout -> verdict: whether physics got the robot where the plan says.
+"""Plan, rollout -> verdict: whether the robot ended where the plan says.
 
 A rollout holds what was measured and nothing else, so that whoever writes one down is
 judged alike: `measure` makes figures of it, `judge` compares them with their limits.
@@ -102,7 +102,7 @@ class Criterion:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Verdict(Shown):
-    """Whether physics got the robot there, and by which figures.
+    """Success or failure in physics, and the figures that it rests on.
 
     Attributes:
         reached: Every criterion is met.

@@ -81,7 +81,7 @@ class Interval:
 
 
 def intervals_of(plan: Plan) -> dict[str, Interval]:
-    """The contacts of a plan's sequence that can be moved: those made on the way.
+    """The contacts of a plan's sequence that can be moved: those made after the start.
 
     By a name for people, in order.
     """
@@ -178,7 +178,7 @@ def save_edited(
 
 
 class Editor:
-    """Contacts and boxes to move, surfaces to switch off, and what becomes of it."""
+    """Contacts and boxes to move, surfaces to switch off; plan and simulate again."""
 
     def __init__(
         self,
@@ -355,7 +355,7 @@ class Editor:
     # What is said and done.
 
     def _tell(self) -> None:
-        """What is edited, what came of it, and what can be done now."""
+        """Show the edits, the result, and which buttons can be pressed."""
         said = []
         for name, (support, place) in self._edits.moved.items():
             x = self._intervals[name]

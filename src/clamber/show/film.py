@@ -147,7 +147,7 @@ def _middle(x: np.ndarray) -> float:
 
 
 def speedup_of(duration: float) -> int:
-    """How much faster than it was a run of that many seconds is shown."""
+    """By how much a run of that many seconds is sped up."""
     speedup = 1
     while duration > SPEEDUP_AFTER and duration / speedup > VIDEO_SECONDS:
         speedup *= 2

@@ -153,7 +153,7 @@ def _person_of(
 def _show_run(
     page: Page, run: Run, others: Sequence[Run] = (), person: Skeleton | None = None
 ) -> None:
-    """The page of a run folder: of its motion, else of its recording, else of words."""
+    """The page of a run folder: its motion, else its recording, else text."""
     notes = (fallback_note(run.written), run.execution.get("stopped", ""))
     page.begin(run.folder.resolve().name, run.missing, notes)
     if run.verdict:
@@ -177,7 +177,7 @@ def _show_recording(page: Page, skeleton: Skeleton) -> None:
 
 
 def _add_verdict(page: Page, verdict: Verdict) -> None:
-    """Whether the robot got there, and each criterion."""
+    """Success or failure, and each criterion."""
     gui = page.server.gui
     colour = "#16a34a" if verdict.reached else "#dc2626"
     said = "reached the goal" if verdict.reached else "failed"
@@ -265,7 +265,7 @@ class _RunPage:
             self._span()
 
     def _pair(self, plan: Plan) -> None:
-        """Have the person keep time with the robot."""
+        """Synchronise the person with the robot."""
         if self._figure is not None:
             stage, person = self._stage, self._figure.skeleton
             self._paired = paired_times(plan, stage.reached, stage.duration, person)

@@ -36,7 +36,7 @@ SECTIONS, CELLS = (150, 157, 166), (176, 183, 192)  # of the ground, light and d
 
 
 class Clock:
-    """Time that plays, is scrubbed and stepped, and what is told of it."""
+    """Playback time: play, scrub and step; callbacks are told of each change."""
 
     def __init__(self, show: Callable[[float], None]) -> None:
         """Nothing to show yet.
@@ -318,7 +318,7 @@ class Page:
             self.aim(client)
 
     def _carry(self, t: float) -> None:
-        """Have the cameras go the way of the robot."""
+        """Move the cameras along with the robot."""
         if self._where is None:
             return
         at = self._where(t)
@@ -352,7 +352,7 @@ class Page:
 
 
 class Work:
-    """One thing at a time that takes a while: how far it is, and what came of it."""
+    """A job at a time, with its progress bar and its result."""
 
     def __init__(self, gui: Any, changed: Callable[[], None] = lambda: None) -> None:
         """Add a bar and a line to the panel.
@@ -407,7 +407,7 @@ class Work:
 
 
 def check_address(host: str, port: int) -> None:
-    """Whether this machine can listen there: viser would try on and on.
+    """Check that this machine can listen there: viser would retry without end.
 
     Raises:
         InputError: It is no port, or the host is none of this machine.

@@ -93,20 +93,20 @@ class Bodies:
             frame.visible = on
 
     def fade(self, opacity: float | None) -> None:
-        """How much of them is to be seen; None: all."""
+        """Their opacity, 0 to 1; None: opaque."""
         for part in self._parts:
             part.opacity = opacity
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(nb,) whether bodies with poses (nb, 7) can be told from those of others."""
+    """(nb,) whether bodies with poses (nb, 7) visibly differ from others."""
     cosine = np.minimum(np.abs(np.sum(a[:, 3:] * b[:, 3:], axis=1)), 1.0)
     off = np.linalg.norm(a[:, :3] - b[:, :3], axis=1)
     return (off > ALIKE) | (2 * np.arccos(cosine) > ALIKE_TURNED)
 
 
 class Ghost:
-    """A robot as it would be elsewhere in time: pale, where it is not as it is."""
+    """A half-transparent robot, as planned or before editing, where the two differ."""
 
     def __init__(
         self,
@@ -254,7 +254,7 @@ class Stage:
         under_way = change_at(self.changes, self.reached, t)
         facts = [f"{t:.2f} of {self.duration:.1f} s; {under_way}"]
         if math.isfinite(m.margin[row]):
-            facts.append(f"centre of mass {1000 * m.margin[row]:.0f} mm inside")
+            facts.append(f"CoM margin {1000 * m.margin[row]:.0f} mm")
         return paragraphs(facts)
 
     def seen(self) -> np.ndarray:

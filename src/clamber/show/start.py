@@ -1,4 +1,4 @@
-"""The page on which a climb begins: recording, robot, something to climb, and climb.
+"""The start page: choose a recording, a robot and a scene, and climb.
 
 What is chosen is a `Climb`, the flags of `clamber climb`; the work is `run_climb`'s.
 """

@@ -99,7 +99,7 @@ class Climb:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClimbResult:
-    """What became of a climb.
+    """The outcome of a climb.
 
     Attributes:
         reached: The verdict.

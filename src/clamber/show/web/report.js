@@ -374,11 +374,11 @@ const PLOTS = [
     most.forEach((i, k) => lines.push({ name: `${m.joints[i]} (${neat(m.effortLimits[i])} N m)`, colour: colourOf([0, 2, 4, 6, 5][k]), at: (r) => m.arrays.effort(r, i) }));
     return { lines, limits: [{ value: 1, name: "limit" }, { value: -1 }], at: [-1.08, 1.08] };
   }],
-  ["Centre of mass inside the support polygon [m]", (run, m) => {
+  ["CoM margin in the support polygon [m]", (run, m) => {
     if (!m.arrays.margin) return null;
     const lines = [{ name: m.loads ? "measured" : "planned", colour: "#2563eb", at: (r) => m.arrays.margin(r) }];
     if (m.arrays.plannedMargin) lines.unshift({ name: "planned", colour: "#94a3b8", dashed: true, at: (r) => m.arrays.plannedMargin(r) });
-    return { lines, limits: [{ value: 0, name: "border" }, { value: m.marginAsked, name: "asked of keyframes", colour: "#16a34a" }], digits: 3 };
+    return { lines, limits: [{ value: 0, name: "border" }, { value: m.marginAsked, name: "required at keyframes", colour: "#16a34a" }], digits: 3 };
   }],
   ["Joint tracking error [rad]", (run, m) => m.arrays.error && {
     lines: [{ name: "largest", colour: "#c2410c", at: (r) => m.arrays.error(r, 0) }, { name: "root mean square", colour: "#2563eb", at: (r) => m.arrays.error(r, 1) }], limits: [], floor: 0, digits: 3 }],
@@ -434,7 +434,7 @@ function sheet(run, motion, i) {
     const canvas = el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n });
     later(canvas, () => { STILLS.push(canvas); drawStills(); });
     return el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` }, canvas,
-      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
+      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM margin ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
   };
   const box = el("div", { class: "sheet" });
   return [box, paged(run.keyframes.length, 12, (from, to) => box.replaceChildren(...run.keyframes.slice(from, to).map((k, n) => tile(k, from + n))))];
