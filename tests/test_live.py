@@ -20,11 +20,11 @@ from clamber.contact.contact import region_of
 from clamber.errors import InputError, MissingDependency
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
-from clamber.show import editor
+from clamber.show import editor, scene3d
 from clamber.show.editor import Edits
 from clamber.show.live import open_view
 from clamber.show.page import Clock, paragraphs
-from clamber.show.sample import keyframe_times
+from clamber.show.sample import keyframe_times, sample_motion
 from clamber.show.skeleton import (
     Skeleton,
     paired_times,
@@ -102,6 +102,22 @@ def test_by_a_policy_robot_and_person_come_onto_the_box_at_the_same_time(
     stuck = [t if r != "O" else None for t, r in zip(reached, mine, strict=True)]
     robot, person = paired_times(plan, stuck, 999.0, climber)
     assert person[-1] == pytest.approx(began[regions.index("O")])
+
+
+def test_a_long_run_is_sampled_no_finer_than_it_can_be_opened_at_once(
+    whole: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sampled = []
+
+    def noted(*args: Any) -> Any:
+        sampled.append(sample_motion(*args))
+        return sampled[-1]
+
+    monkeypatch.setattr(scene3d, "MOST", 20)
+    monkeypatch.setattr(scene3d, "sample_motion", noted)
+    page = open_view(whole, port=18090)
+    page.close()
+    assert [len(m.time) <= 20 for m in sampled] == [True]
 
 
 # Edits.

@@ -39,6 +39,7 @@ from clamber.show.skeleton import Skeleton
 # One level of meshes, at rest and in motion, that a processor draws in time too.
 TRIANGLES, DEVIATION = 15_000, 0.0008  # [m] that faces may be off a round geom
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
+MOST = 3000  # samples of a long run: two minutes at 25 Hz, ten at 5 Hz
 GHOST, BEFORE, GHOST_OPACITY = (59, 130, 246), (217, 70, 239), 0.3
 SEE_THROUGH = 0.45
 BEFORE_EDITING = "before editing"  # the layer of the plan as it was
@@ -172,7 +173,7 @@ class Stage:
             root: Name of the node that all hang in.
             before: Whose robot is shown too on request, as it is at the same time.
         """
-        self.motion = m = sample_motion(plan, rollout, {})
+        self.motion = m = sample_motion(plan, rollout, {}, MOST)
         self.reached = keyframe_times(plan, rollout)
         self.changes = [f"stance {c.step.stance}: {c.step}" for c in plan.changes]
         as_planned = rollout is None or rollout.followed is None
