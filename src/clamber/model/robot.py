@@ -250,7 +250,7 @@ def _check(robot: Robot, source: Path) -> None:
             prefix = robot.prefixes[s]
             if not any(has_prefix(g, prefix) for g in geoms):
                 expected = (
-                    f"a surface: a geom of {file} whose name begins with {prefix!r}"
+                    f"a surface: geoms of {file} whose names begin with {prefix!r}"
                 )
                 raise InputError(expected, source, f"{where}.surfaces", s)
 
