@@ -507,7 +507,7 @@ def _draw(
         report = clock.watching(show)
         try:
             clamber.render_run(folder, report=report, **options)
-        except ClamberError as e:  # it has made it all the same
+        except ClamberError as e:  # the climb is as it is all the same
             missing = (str(e),)
         _save_timings(folder, clock)
     output.warn(*missing)
