@@ -5,9 +5,9 @@ the contact is taken where it is; one that has not touched at the planned point 
 probed for along the normal until it does, or until `REACH` is used up. Where a contact
 is not where it was planned, the supports are estimated anew from all contacts measured
 so far, the stance is taken as it is, and the remaining contact changes are planned
-again from there while the robot stands still. A contact that carries nothing at the end
-of a change is re-established by probing. Where nothing is found, the others carry the robot and
-another place is planned for the limb; where there is none, the robot stays in the
+again from there while the robot stands still. A contact that carries no load at the end
+of a change is re-established by probing. Where nothing is found, the others carry the
+robot and another place is planned for the limb; where there is none, it stays in the
 stance it is in and says why.
 
 Beside the plan there are four reactions, the most urgent first: to an unintended
