@@ -116,7 +116,7 @@ def split_steps(
 ) -> tuple[list[Step], list[Skipped]]:
     """Split each change of stance into steps of one limb, or say why there is none.
 
-    A limb that only leaves its contact is part of its next change where it has one. Where
+    A limb that only leaves its contact is part of its next step where it has one. Where
     two surfaces of a limb are down at once, the one nearer to the trunk bears the load.
 
     Args:
@@ -144,7 +144,7 @@ def split_steps(
                     continue
                 if _comes_back(sequence, i, limb.surfaces):
                     side = limb.name.replace("_", " ")
-                    reasons.append(f"{side} in the air: part of its next contact change")
+                    reasons.append(f"{side} in the air: part of its next step")
                     continue
                 makes, breaks = None, (down,)
             else:
