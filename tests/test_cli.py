@@ -314,7 +314,7 @@ def quick_climb(one_hand_plan, one_hand_rollout, monkeypatch: Patch) -> SimpleNa
         said.drawing = options
         if said.no_opengl:
             raise clamber.ClamberError("no OpenGL")
-        return []
+        return [args[0] / "climb.png"]
 
     for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
         note(name, getattr(clamber, name))
@@ -334,6 +334,8 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
     saved = ["save_sequence", "plan", "save_plan", "simulate", "save_rollout", "judge"]
     assert quick_climb.calls == [*saved, "save_verdict", "render_run"]
     assert quick_climb.drawing["with_video"] is True
+    look = f"{tmp_path / 'a' / 'climb.png'} shows it; `clamber report {tmp_path / 'a'}`"
+    assert out.splitlines()[-1].startswith(look)
     row = next(r for r in out.splitlines() if r.startswith("air -> LHand on box"))
     key = quick_climb.plan.keyframes[-1]
     for value in (

@@ -502,15 +502,18 @@ def _draw(
     **options: Any,
 ) -> None:
     """Pictures, after the verdict has been shown."""
-    missing = ()
+    missing, files = (), []
     with output.progress(track) as show, filling(folder):
         report = clock.watching(show)
         try:
-            clamber.render_run(folder, report=report, **options)
+            files = clamber.render_run(folder, report=report, **options)
         except ClamberError as e:  # the climb is as it is all the same
             missing = (str(e),)
         _save_timings(folder, clock)
     output.warn(*missing)
+    if files:
+        page = f"`clamber report {folder}` makes a page of it"
+        output.tell(f"{files[-1]} shows it; {page}")
 
 
 def _save_timings(folder: Path, clock: Clock) -> None:

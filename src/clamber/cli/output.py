@@ -62,6 +62,12 @@ class Output:
         for text in texts if not self.quiet else ():
             sys.stderr.write(f"clamber: {text}\n")
 
+    def tell(self, text: str) -> None:
+        """Say what else there is, to people alone, on stdout."""
+        if not (self.json or self.quiet):
+            sys.stdout.write(f"{text}\n")
+            sys.stdout.flush()
+
     def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
         """Print one JSON object, or tables and a closing sentence, on stdout."""
         if self.json:
