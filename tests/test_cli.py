@@ -330,12 +330,12 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
 ):
     words = ["climb", "--height", "0.25", "--video"]
     cli.main([*words, "--out", str(tmp_path / "a")])
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
     saved = ["save_sequence", "plan", "save_plan", "simulate", "save_rollout", "judge"]
     assert quick_climb.calls == [*saved, "save_verdict", "render_run"]
     assert quick_climb.drawing["with_video"] is True
     look = f"{tmp_path / 'a' / 'climb.png'} shows it; `clamber report {tmp_path / 'a'}`"
-    assert out.splitlines()[-1].startswith(look)
+    assert err.splitlines()[-1].startswith(look)
     row = next(r for r in out.splitlines() if r.startswith("air -> LHand on box"))
     key = quick_climb.plan.keyframes[-1]
     for value in (

@@ -63,10 +63,9 @@ class Output:
             sys.stderr.write(f"clamber: {text}\n")
 
     def tell(self, text: str) -> None:
-        """Say what else there is, to people alone, on stdout."""
+        """Say what else there is, to people alone, on stderr."""
         if not (self.json or self.quiet):
-            sys.stdout.write(f"{text}\n")
-            sys.stdout.flush()
+            sys.stderr.write(f"{text}\n")
 
     def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
         """Print one JSON object, or tables and a closing sentence, on stdout."""
