@@ -271,8 +271,8 @@ def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> np.ndarray:
 def _fits_upright(spec: mujoco.MjSpec, meshes: Mapping[str, MeshFile]) -> bool:
     """Whether a description expects the up axis of COLLADA files to be applied.
 
-    RViz and Gazebo ignore it, Bullet applies it, and people write for what they use. The
-    joints of a link tell: they are within its meshes or near them. Sums up how far
+    RViz and Gazebo ignore it, Bullet applies it, and people write for what they use.
+    The joints of a link tell: they are within its meshes or near them. Sums up how far
     each is from the box around each mesh, with the axis ignored and applied.
     """
     off = np.zeros(2)
