@@ -30,10 +30,9 @@ from clamber.cli.output import (
     filling,
     new_table,
 )
-from clamber.cli.progress import Report, Track
+from clamber.cli.progress import Report
 from clamber.errors import ClamberError, InputError
-
-DRAWING = ("pictures", "video")
+from clamber.show.track import DRAWING, Track
 
 
 @dataclass(frozen=True, kw_only=True)
