@@ -286,7 +286,7 @@ def test_plain_mujoco_loads_the_scene_and_the_trajectory_fits(plan: Plan, saved:
 def test_a_plan_takes_no_more_than_what_gives_its_samples(plan: Plan, copied: Path):
     """A tenth of them; samples that nothing gives are all written."""
     path, t = copied / PLANNED_TRAJECTORY, plan.trajectory
-    assert path.stat().st_size < 0.02 * np.asarray(t.q).nbytes
+    assert path.stat().st_size < 0.1 * np.asarray(t.q).nbytes
     for name in ("q", "v", "tau"):
         changed = replace(t, **{name: np.array(getattr(t, name)) + 0.1})
         save_trajectory(changed, path)
@@ -302,7 +302,7 @@ def test_runs_of_any_speed_survive_the_disk(plan: Plan, tmp_path: Path, speed):
     assert same(back, t)
 
 
-@pytest.mark.parametrize("name", ["run_sizes", "node_s", "node_qpos", "run_cruise"])
+@pytest.mark.parametrize("name", ["run_sizes", "node_s", "node_qpos", "run_ends"])
 def test_runs_that_do_not_fit_together_are_named(plan: Plan, copied: Path, name: str):
     path = copied / PLANNED_TRAJECTORY
     with np.load(path) as f:

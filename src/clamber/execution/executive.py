@@ -68,7 +68,7 @@ MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 0.1  # [s] the robot stands still while the rest is planned again
 SEARCHING = 1.0  # [s] ... where other contacts are looked for
-FEEL = 0.08  # [s] later than planned that a contact may be felt
+FEEL = 0.01  # [s] later than planned that a contact may be felt
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for such a load
@@ -289,6 +289,7 @@ class Executive:
         yield from ref.stop()
         if touches(c):
             return False
+        yield from ref.back(span.touch)  # where the others hold the robot
         found = yield from self._probe(c)
         if found is None:
             yield from self._seek(c)
