@@ -261,8 +261,11 @@ def test_an_obj_with_y_up_is_asked_about_and_never_half_buried(tmp_path, rng):
 def test_an_obj_of_another_shape_is_named(tmp_path):
     text = triangulated([1.0, 1.2, 0.2], False) + "v 0 0 0.4\nf 5 6 9\n"
     (tmp_path / "b.obj").write_text("o rock\n" + text)
+    (tmp_path / "s.yaml").write_text("boxes: b.obj\n")
     with pytest.raises(InputError, match=r"rock is '9 corners'.*put boxes in its"):
-        load_scene(tmp_path / "b.obj")
+        load_scene(tmp_path / "s.yaml")
+    (mesh,) = load_scene(tmp_path / "b.obj").meshes  # by itself it is a mesh
+    assert mesh.name == "b"
 
 
 def test_a_missing_drawing_is_named(tmp_path):

@@ -55,7 +55,7 @@ def _box_names(sequence: ContactSequence, world: World) -> dict[str, str]:
             if c.support != GROUND
         )
     )
-    boxes = [b.name for b in world.scene.boxes]
+    boxes = [s.name for s in world.scene.tops]
     if sequence.subject is None and set(touched) <= set(boxes):
         return {name: name for name in touched}  # a robot's own plan
     if len(boxes) < len(touched):

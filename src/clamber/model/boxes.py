@@ -34,6 +34,10 @@ _SAME = 1e-5  # of the size of all: nearer vertices are one corner
 _NO_BOX = "no other shapes than boxes are climbed: put boxes in its place"
 
 
+class NoBox(InputError):
+    """A shape that was drawn is no box."""
+
+
 def read_obj(
     path: Path,
     scale: float = 1.0,
@@ -187,7 +191,7 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
     """The box (8, 3) vertices belong to, in any order: upright if it can be."""
     if len(v) != 8:
         found = f"{len(v)} corners"
-        raise InputError(f"8 vertices of a box: {_NO_BOX}", path, name, found)
+        raise NoBox(f"8 vertices of a box: {_NO_BOX}", path, name, found)
     order = np.argsort(v[:, 2], kind="stable")
     base = v[order[:4]]
     # Of the three ways from one corner to the others the longest is the diagonal.
@@ -202,7 +206,7 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
             R = tilted
             off, low, high = _extent(v, R)
     if off > _FIT or np.any(high - low < _FIT):
-        raise InputError(
+        raise NoBox(
             "8 vertices of a box "
             f"(one is {off:.3f} m off; size {(high - low).round(3).tolist()})",
             path,
