@@ -146,18 +146,53 @@ def _beside(piece: np.ndarray, support: Support) -> float:
 # Triangles -> regions.
 
 
-def neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def neighbours(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(E, 2) faces with an edge in common, and (E, 2) which edge of each that is.
 
-    Edge k of a face goes from its vertex k to the next.
+    Edge k of a face goes from its vertex k to the next. Where more than two faces meet,
+    as solids do that touch along an edge, those are neighbours that have the same solid
+    between them.
     """
-    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    ends = np.sort(ends, axis=1).astype(np.int64)
-    key = ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1]
+    a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b)
+    key = low * (int(faces.max()) + 1) + high
     order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(key[order][1:] == key[order][:-1])
-    half = np.stack([order[same], order[same + 1]], axis=1)
-    return half // 3, half % 3
+    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    count = np.diff(starts, append=len(order))
+    two = starts[count == 2]
+    half = [np.stack([order[two], order[two + 1]], axis=1)]
+    for start, n in zip(starts[count > 2], count[count > 2], strict=True):
+        some = order[start : start + n]
+        found = _around(vertices, faces, some, a[some] == low[some])
+        half.append(np.array(found, dtype=np.int64).reshape(-1, 2))
+    pairs = np.concatenate(half)
+    return pairs // 3, pairs % 3
+
+
+def _around(
+    vertices: np.ndarray, faces: np.ndarray, half: np.ndarray, along: np.ndarray
+) -> list[tuple[int, int]]:
+    """Which half-edges (n,) of one edge are neighbours, by angles about it.
+
+    From a face that has the edge `along` it, the solid is on the side to which one
+    turns with the clock, as far as the next face that has it the other way round.
+    """
+    first = half[np.argmax(along)]
+    p, q = vertices[faces[first // 3, [first % 3, (first % 3 + 1) % 3]]]
+    axis = (q - p) / max(float(np.linalg.norm(q - p)), 1e-12)
+    far = vertices[faces[half // 3, (half % 3 + 2) % 3]] - p
+    far = far - np.outer(far @ axis, axis)
+    x = far[0] / max(float(np.linalg.norm(far[0])), 1e-12)
+    angle = np.arctan2(far @ np.cross(axis, x), far @ x)
+    out, free = [], list(np.flatnonzero(~along))
+    for i in np.flatnonzero(along):
+        if not free:
+            break
+        turn = [(angle[i] - angle[j] - 1e-6) % (2 * np.pi) for j in free]
+        out.append((int(half[i]), int(half[free.pop(int(np.argmin(turn)))])))
+    return out
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -174,7 +209,7 @@ def _evenness(vertices: np.ndarray, faces: np.ndarray) -> tuple[float, float]:
     In a plane with noise sigma, the far vertex of a neighbour is off a triangle's plane
     by about two sigma; at real edges by more, so that the lower quartile is looked at.
     """
-    pairs, edge = neighbours(faces)
+    pairs, edge = neighbours(vertices, faces)
     if len(pairs) == 0:
         return SMOOTH, TURN
     normals, _ = _normals(vertices, faces)
@@ -244,7 +279,7 @@ def merged(
 
 def _denoised(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices moved so that triangles have the normals that are smoothed."""
-    pairs, _ = neighbours(faces)
+    pairs, _ = neighbours(vertices, faces)
     normals, areas = _normals(vertices, faces)
     soft = _smoothed(normals, areas, pairs, ROUNDS)
     count = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
@@ -265,7 +300,7 @@ def _regions(
 ) -> list[_Region]:
     """Planar regions, in the order in which they were found: the flattest first."""
     normals, areas = _normals(vertices, faces)
-    pairs, edge = neighbours(faces)
+    pairs, edge = neighbours(vertices, faces)
     n = len(faces)
     part = connected_components(
         coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n)), directed=False
@@ -290,7 +325,8 @@ def _regions(
         math.cos(turn),
     )
     label = _joined(vertices, faces, normals, areas, pairs, label, reach)
-    return _bordered(vertices, faces, normals, areas, pairs, edge, label, part)
+    ragged = reach if turn > TURN else 0.0
+    return _bordered(vertices, faces, normals, areas, pairs, edge, label, part, ragged)
 
 
 def _joined(
@@ -349,8 +385,12 @@ def _bordered(
     edge: np.ndarray,
     label: np.ndarray,
     part: np.ndarray,
+    ragged: float,
 ) -> list[_Region]:
-    """The regions of labels (F,), each with the plane that fits it and its border."""
+    """The regions of labels (F,), each with the plane that fits it and its border.
+
+    Borders of noisy meshes are `ragged` by so much [m].
+    """
     inner = np.zeros((len(faces), 3), dtype=bool)
     same = label[pairs[:, 0]] == label[pairs[:, 1]]
     for k in range(2):
@@ -371,7 +411,7 @@ def _bordered(
         R = frame_from_normal(normal, [1.0, 0.0, 0.0])
         flat = ((corners - origin) @ R)[..., :2]
         ends = np.stack([flat, np.roll(flat, -1, axis=1)], axis=2)[~inner[mine]]
-        shape = _area_in(ends, flat)
+        shape = _area_in(ends, flat, ragged)
         if not shape.is_empty:
             out.append(
                 _Region(origin=origin, rotation=R, shape=shape, part=int(part[mine[0]]))
@@ -389,17 +429,26 @@ def _fitted(
     return best if values[1] > 4 * values[0] and best @ normal > 0.9 else normal
 
 
-def _area_in(ends: np.ndarray, triangles: np.ndarray) -> BaseGeometry:
+def _area_in(ends: np.ndarray, triangles: np.ndarray, ragged: float) -> BaseGeometry:
     """What is inside border lines (n, 2, 2), straightened, small holes closed.
 
     Where lines cross, as the folds of a noisy border do, the triangles (m, 3, 2) are
     put together instead.
     """
-    shape = shapely.build_area(shapely.MultiLineString(list(ends)))
     area = float(np.abs(_doubled_area(triangles)).sum() / 2)
-    if not shape.is_valid or abs(shape.area - area) > 0.02 * area:
+    try:
+        shape = shapely.build_area(shapely.MultiLineString(list(ends)))
+        whole = shape.is_valid and abs(shape.area - area) < 0.02 * area
+    except shapely.errors.GEOSException:
+        whole = False
+    if not whole:
         shape = shapely.union_all(shapely.make_valid(shapely.polygons(triangles)))
-    return _tidied(shape)
+    if ragged > 0.0:
+        even = shape.buffer(ragged, join_style="mitre", mitre_limit=2.0)
+        even = even.buffer(-2.0 * ragged, join_style="mitre", mitre_limit=2.0)
+        even = even.buffer(ragged, join_style="mitre", mitre_limit=2.0)
+        shape = shape if even.is_empty else even
+    return _tidied(shape, max(BORDER, ragged))
 
 
 def _doubled_area(triangles: np.ndarray) -> np.ndarray:
@@ -407,14 +456,14 @@ def _doubled_area(triangles: np.ndarray) -> np.ndarray:
     return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
 
 
-def _tidied(shape: BaseGeometry) -> BaseGeometry:
+def _tidied(shape: BaseGeometry, border: float = BORDER) -> BaseGeometry:
     """Polygons with few corners, without slits, slivers and pinholes."""
     kept = [p for p in _polygons(shape) if p.area > 1e-6]
     kept = [
         shapely.Polygon(p.exterior, [h for h in p.interiors if _ring_area(h) > 4e-4])
         for p in kept
     ]
-    return shapely.make_valid(shapely.union_all(kept).simplify(BORDER))
+    return shapely.make_valid(shapely.union_all(kept).simplify(border))
 
 
 def _ring_area(ring: shapely.LinearRing) -> float:
@@ -534,7 +583,7 @@ def _convex_parts(
     vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[list[np.ndarray], dict[int, int]]:
     """Corners (K, 3) of the connected parts that are convex, and which each is."""
-    pairs, _ = neighbours(faces)
+    pairs, _ = neighbours(vertices, faces)
     n = len(faces)
     count, part = connected_components(
         coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n)), directed=False

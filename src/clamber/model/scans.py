@@ -49,7 +49,7 @@ def read_terrain(
     Raises:
         InputError: It cannot be used.
     """
-    check_kind(path, "a mesh or a cloud of points", "npy")
+    check_kind(path, "a mesh or a cloud of points", "npy", "ply", "gltf")
     suffix = path.suffix.lower()
     corners, points = np.zeros((0, 3, 3)), np.zeros((0, 3))
     if suffix == ".npy":
@@ -129,24 +129,39 @@ def mended(
     x, y, z = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(y - x, z - x), axis=1) / 2
     faces = faces[(a != b) & (b != c) & (c != a) & (area > 1e-12)]
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    if len(once) < len(faces):
-        notes.append(f"{len(faces) - len(once)} doubled triangles left out")
-        faces = faces[np.sort(once)]
+    faces, doubled = _once(faces)
+    if doubled:
+        notes.append(f"{doubled} doubled triangles left out")
     if len(faces) == 0:
         raise InputError("a mesh with triangles", path)
     faces, turned = _outwards(vertices, faces)
     if turned:
         notes.append(f"{turned} triangles that faced the wrong way turned round")
-    pairs, _ = neighbours(faces)
+    pairs, _ = neighbours(vertices, faces)
     if (open_ := 3 * len(faces) - 2 * len(pairs)) > 0:
         notes.append(f"not closed ({open_} open edges): solid behind what it shows")
     return (vertices, faces), notes
 
 
+def _once(faces: np.ndarray) -> tuple[np.ndarray, int]:
+    """Faces (F, 3) without those that are there twice, and how many were.
+
+    Where most are there both ways round, that is the one sheet from both of its sides;
+    where few are, they are between solids that touch, and stay.
+    """
+    rolled = np.stack([np.roll(faces, k, axis=1) for k in range(3)], axis=1)
+    same = rolled[np.arange(len(faces)), np.argmin(rolled[:, :, 0], axis=1)]
+    _, first = np.unique(same, axis=0, return_index=True)
+    out = faces[np.sort(first)]
+    _, first = np.unique(np.sort(out, axis=1), axis=0, return_index=True)
+    if len(out) - len(first) > 0.3 * len(out):
+        out = out[np.sort(first)]
+    return out, len(faces) - len(out)
+
+
 def _outwards(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
     """Faces (F, 3) turned out of what they enclose, or up; and how many were not."""
-    pairs, edge = neighbours(faces)
+    pairs, edge = neighbours(vertices, faces)
     n = len(faces)
     start = faces[pairs, edge]
     against = start[:, 0] == start[:, 1]  # along the common edge, the same way
