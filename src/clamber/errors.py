@@ -182,8 +182,8 @@ def check_kind(path: Path, expected: str, *own: str) -> bytes:
     Args:
         path: The file.
         expected: What is wanted, for the message: `a scene`.
-        own: Short names of kinds that will do: npz, pickle, npy, bvh, trc, csv, xml, ply,
-            gltf.
+        own: Short names of kinds that will do: npz, pickle, npy, bvh, trc, csv,
+            xml, ply, gltf.
 
     Returns:
         Its first bytes.

@@ -13,6 +13,7 @@ the frame P of their region: origin in its plane, z along the outward normal.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -59,12 +60,14 @@ class _Region:
         rotation: (3, 3) R_WP.
         shape: A polygon in P, or several.
         part: Which connected part of the mesh it is of.
+        ragged: Its border is so uneven for noise [m].
     """
 
     origin: np.ndarray
     rotation: np.ndarray
     shape: BaseGeometry
     part: int
+    ragged: float
 
     __repr__ = short_repr
 
@@ -112,7 +115,7 @@ def mesh_of(
         if region.part in of_part:
             under[i] = [of_part[region.part]]
             continue
-        for ring in _convex_rings(region.shape):
+        for ring in _convex_rings(region.shape, region.ragged):
             under.setdefault(i, []).append(len(pieces) + len(tops))
             tops.append((i, ring))
     pieces += _solids(regions, tops)
@@ -179,6 +182,8 @@ def _around(
     From a face that has the edge `along` it, the solid is on the side to which one
     turns with the clock, as far as the next face that has it the other way round.
     """
+    if 2 * along.sum() != len(half):  # no surfaces of solids
+        return [(int(i), int(j)) for i, j in itertools.pairwise(half)]
     first = half[np.argmax(along)]
     p, q = vertices[faces[first // 3, [first % 3, (first % 3 + 1) % 3]]]
     axis = (q - p) / max(float(np.linalg.norm(q - p)), 1e-12)
@@ -414,7 +419,13 @@ def _bordered(
         shape = _area_in(ends, flat, ragged)
         if not shape.is_empty:
             out.append(
-                _Region(origin=origin, rotation=R, shape=shape, part=int(part[mine[0]]))
+                _Region(
+                    origin=origin,
+                    rotation=R,
+                    shape=shape,
+                    part=int(part[mine[0]]),
+                    ragged=ragged,
+                )
             )
     return out
 
@@ -481,15 +492,19 @@ def _polygons(shape: BaseGeometry) -> Iterator[shapely.Polygon]:
 # Polygons -> convex parts.
 
 
-def _convex_rings(shape: BaseGeometry) -> list[np.ndarray]:
-    """Convex polygons (K, 2), counter-clockwise, that make up polygons."""
+def _convex_rings(shape: BaseGeometry, ragged: float) -> list[np.ndarray]:
+    """Convex polygons (K, 2), counter-clockwise, that make up polygons.
+
+    Notches in their borders are filled, deeper ones where borders are `ragged` [m].
+    """
+    fill = max(FILL, 2.0 * ragged)
     out = []
     for polygon in _polygons(shape):
         hull = polygon.convex_hull
-        if hull.area - polygon.area < 1e-3 * hull.area + 1e-7:
+        if polygon.buffer(fill).covers(hull):
             rings = [_ring(hull)]
         else:
-            rings = _merged(polygon)
+            rings = _merged(polygon, fill)
         out += [r for r in map(_strict, rings) if r is not None]
     return out
 
@@ -505,7 +520,7 @@ def _signed(ring: np.ndarray) -> float:
     return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
-def _merged(polygon: shapely.Polygon) -> list[np.ndarray]:
+def _merged(polygon: shapely.Polygon, fill: float) -> list[np.ndarray]:
     """Triangles, put together over their longest common edges while that is convex."""
     cut = shapely.constrained_delaunay_triangles(polygon)
     triangles = [_ring(t) for t in shapely.get_parts(cut) if t.area > 1e-9]
@@ -524,7 +539,7 @@ def _merged(polygon: shapely.Polygon) -> list[np.ndarray]:
         ((a, b) for a, b in of_edge if a < b and (b, a) in of_edge),
         key=lambda e: (-float(np.sum((points[e[0]] - points[e[1]]) ** 2)), e),
     )
-    room = polygon.buffer(FILL)
+    room = polygon.buffer(fill)
     shapely.prepare(room)
     root = list(range(len(ids)))
 
@@ -717,13 +732,19 @@ def _supports(
         left = shape.difference(shapely.union_all(covers)) if covers else shape
         left = _tidied(left)
         reject(shape.difference(left.buffer(BORDER)), "covered")
-        for polygon in _polygons(left.buffer(-1e-3).buffer(1e-3, join_style="mitre")):
-            for ring in _convex_rings(_tidied(polygon)):
+        for polygon in _polygons(_shrunk(left, region.ragged)):
+            for ring in _convex_rings(_tidied(polygon), region.ragged):
                 if shapely.Polygon(ring).buffer(-NARROW).is_empty:
                     reject(shapely.Polygon(ring), "too narrow")
                 else:
                     found.append((i, ring))
     return found, rejected
+
+
+def _shrunk(shape: BaseGeometry, ragged: float) -> BaseGeometry:
+    """Without what is thinner than a hair, and where noise may have added to it."""
+    inner = shape.buffer(-1e-3 - ragged, join_style="mitre")
+    return inner.buffer(1e-3, join_style="mitre")
 
 
 def _above_ground(region: _Region) -> BaseGeometry:
