@@ -73,8 +73,8 @@ def main() -> None:
     parser.add_argument("--judge", type=Path)
     parser.add_argument("--out", type=Path, help="where to write the table")
     args = parser.parse_args()
-    rows, names = [], sorted(args.terrains.glob(f"*{args.only}*"))
-    for folder in names:
+    rows, names = [], sorted(args.terrains.glob(f"*{args.only}*/scene.yaml"))
+    for folder in (n.parent for n in names):
         row = figures(folder, args.runs, args.judge)
         if not rows:
             print("|".join(row), flush=True)

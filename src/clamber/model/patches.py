@@ -104,11 +104,18 @@ def mesh_of(
         roughness: Unevenness beyond what the triangles show [m].
         notes: What was mended, a sentence each.
     """
-    reach, turn = _evenness(vertices, faces)
+    beside = neighbours(faces, vertices)
+    reach, turn = _evenness(vertices, faces, *beside)
     if turn > TURN:
-        vertices, faces = _denoised(*_coarser(vertices, faces, reach))
-    regions = _regions(vertices, faces, reach, turn)
-    pieces, of_part = _convex_parts(vertices, faces)
+        if _median_edge(vertices, faces) < CELL:
+            vertices, faces = merged(vertices, faces, CELL)
+            beside = neighbours(faces)
+        vertices = _denoised(vertices, faces, beside[0])
+    n = len(faces)
+    links = coo_array((np.ones(len(beside[0])), tuple(beside[0].T)), shape=(n, n))
+    part = connected_components(links, directed=False)[1]
+    regions = _regions(vertices, faces, *beside, part, reach, turn)
+    pieces, of_part = _convex_parts(vertices, faces, beside[0], part)
     under: dict[int, list[int]] = {}  # of each region, its pieces
     tops: list[tuple[int, np.ndarray]] = []  # region and ring of what is not convex
     for i, region in enumerate(regions):
@@ -150,13 +157,13 @@ def _beside(piece: np.ndarray, support: Support) -> float:
 
 
 def neighbours(
-    vertices: np.ndarray, faces: np.ndarray
+    faces: np.ndarray, vertices: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """(E, 2) faces with an edge in common, and (E, 2) which edge of each that is.
 
     Edge k of a face goes from its vertex k to the next. Where more than two faces meet,
     as solids do that touch along an edge, those are neighbours that have the same solid
-    between them.
+    between them, where `vertices` are given.
     """
     a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b)
@@ -165,12 +172,17 @@ def neighbours(
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     count = np.diff(starts, append=len(order))
     two = starts[count == 2]
-    half = [np.stack([order[two], order[two + 1]], axis=1)]
+    more: list[tuple[int, int]] = []
     for start, n in zip(starts[count > 2], count[count > 2], strict=True):
         some = order[start : start + n]
-        found = _around(vertices, faces, some, a[some] == low[some])
-        half.append(np.array(found, dtype=np.int64).reshape(-1, 2))
-    pairs = np.concatenate(half)
+        along = a[some] == low[some]
+        if vertices is None or 2 * along.sum() != n:  # no surfaces of solids
+            found = list(itertools.pairwise(some.tolist()))
+        else:
+            found = _around(vertices, faces, some, along)
+        more += found
+    pairs = np.stack([order[two], order[two + 1]], axis=1)
+    pairs = np.concatenate([pairs, np.array(more, dtype=np.int64).reshape(-1, 2)])
     return pairs // 3, pairs % 3
 
 
@@ -182,8 +194,6 @@ def _around(
     From a face that has the edge `along` it, the solid is on the side to which one
     turns with the clock, as far as the next face that has it the other way round.
     """
-    if 2 * along.sum() != len(half):  # no surfaces of solids
-        return [(int(i), int(j)) for i, j in itertools.pairwise(half)]
     first = half[np.argmax(along)]
     p, q = vertices[faces[first // 3, [first % 3, (first % 3 + 1) % 3]]]
     axis = (q - p) / max(float(np.linalg.norm(q - p)), 1e-12)
@@ -208,13 +218,14 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
     return n / np.maximum(length, 1e-300)[:, None], length / 2
 
 
-def _evenness(vertices: np.ndarray, faces: np.ndarray) -> tuple[float, float]:
+def _evenness(
+    vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, edge: np.ndarray
+) -> tuple[float, float]:
     """How far triangles may be from their plane [m], and turned from it [rad].
 
     In a plane with noise sigma, the far vertex of a neighbour is off a triangle's plane
     by about two sigma; at real edges by more, so that the lower quartile is looked at.
     """
-    pairs, edge = neighbours(vertices, faces)
     if len(pairs) == 0:
         return SMOOTH, TURN
     normals, _ = _normals(vertices, faces)
@@ -246,18 +257,11 @@ def _smoothed(
     return normals
 
 
-def _coarser(
-    vertices: np.ndarray, faces: np.ndarray, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh finer than `CELL` with its vertices averaged in cells of that size.
-
-    Noise on shorter edges turns triangles any way; averages have less of it.
-    """
+def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """[m]: noise on shorter edges turns triangles any way."""
     corners = vertices[faces]
     edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
-    if np.median(edges) > CELL:
-        return vertices, faces
-    return merged(vertices, faces, CELL)
+    return float(np.median(edges))
 
 
 def merged(
@@ -282,9 +286,8 @@ def merged(
     return np.stack(out, axis=1), faces[np.sort(first)]
 
 
-def _denoised(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _denoised(vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Vertices moved so that triangles have the normals that are smoothed."""
-    pairs, _ = neighbours(vertices, faces)
     normals, areas = _normals(vertices, faces)
     soft = _smoothed(normals, areas, pairs, ROUNDS)
     count = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
@@ -297,19 +300,21 @@ def _denoised(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
             for x in range(3):
                 move[:, x] += np.bincount(v, by[:, x], len(vertices))
         vertices = vertices + move / count[:, None]
-    return vertices, faces
+    return vertices
 
 
 def _regions(
-    vertices: np.ndarray, faces: np.ndarray, reach: float, turn: float
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    pairs: np.ndarray,
+    edge: np.ndarray,
+    part: np.ndarray,
+    reach: float,
+    turn: float,
 ) -> list[_Region]:
     """Planar regions, in the order in which they were found: the flattest first."""
     normals, areas = _normals(vertices, faces)
-    pairs, edge = neighbours(vertices, faces)
     n = len(faces)
-    part = connected_components(
-        coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n)), directed=False
-    )[1]
     soft = _smoothed(normals, areas, pairs, 4 if turn > TURN else 0)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     bend = 1.0 - np.sum(soft[ends[:, 0]] * soft[ends[:, 1]], axis=1)
@@ -447,12 +452,15 @@ def _area_in(ends: np.ndarray, triangles: np.ndarray, ragged: float) -> BaseGeom
     put together instead.
     """
     area = float(np.abs(_doubled_area(triangles)).sum() / 2)
-    try:
-        shape = shapely.build_area(shapely.MultiLineString(list(ends)))
-        whole = shape.is_valid and abs(shape.area - area) < 0.02 * area
-    except shapely.errors.GEOSException:
-        whole = False
-    if not whole:
+    lines = shapely.MultiLineString(list(ends))
+    for crossing in (False, True):
+        try:
+            shape = shapely.build_area(shapely.node(lines) if crossing else lines)
+        except shapely.errors.GEOSException:
+            continue
+        if shape.is_valid and abs(shape.area - area) < 0.05 * area:
+            break
+    else:
         shape = shapely.union_all(shapely.make_valid(shapely.polygons(triangles)))
     if ragged > 0.0:
         even = shape.buffer(ragged, join_style="mitre", mitre_limit=2.0)
@@ -595,14 +603,10 @@ def _strict(ring: np.ndarray) -> np.ndarray | None:
 
 
 def _convex_parts(
-    vertices: np.ndarray, faces: np.ndarray
+    vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, part: np.ndarray
 ) -> tuple[list[np.ndarray], dict[int, int]]:
     """Corners (K, 3) of the connected parts that are convex, and which each is."""
-    pairs, _ = neighbours(vertices, faces)
-    n = len(faces)
-    count, part = connected_components(
-        coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n)), directed=False
-    )
+    count = int(part.max()) + 1
     closed = np.bincount(part[pairs[:, 0]], minlength=count) * 2
     closed = closed >= 3 * np.bincount(part, minlength=count)
     pieces: list[np.ndarray] = []

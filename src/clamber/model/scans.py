@@ -134,11 +134,10 @@ def mended(
         notes.append(f"{doubled} doubled triangles left out")
     if len(faces) == 0:
         raise InputError("a mesh with triangles", path)
-    faces, turned = _outwards(vertices, faces)
+    faces, turned, open_ = _outwards(vertices, faces)
     if turned:
         notes.append(f"{turned} triangles that faced the wrong way turned round")
-    pairs, _ = neighbours(vertices, faces)
-    if (open_ := 3 * len(faces) - 2 * len(pairs)) > 0:
+    if open_:
         notes.append(f"not closed ({open_} open edges): solid behind what it shows")
     return (vertices, faces), notes
 
@@ -159,9 +158,12 @@ def _once(faces: np.ndarray) -> tuple[np.ndarray, int]:
     return out, len(faces) - len(out)
 
 
-def _outwards(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]:
-    """Faces (F, 3) turned out of what they enclose, or up; and how many were not."""
-    pairs, edge = neighbours(vertices, faces)
+def _outwards(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Faces (F, 3) turned out of what they enclose, or up; how many were not.
+
+    Also how many of their edges are open.
+    """
+    pairs, edge = neighbours(faces, vertices)
     n = len(faces)
     start = faces[pairs, edge]
     against = start[:, 0] == start[:, 1]  # along the common edge, the same way
@@ -190,7 +192,8 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int]
     closed = sides >= 3 * np.bincount(part, minlength=count)
     wrong = np.where(closed, volume, upward) < -1e-12
     flip ^= wrong[part]
-    return np.where(flip[:, None], faces[:, ::-1], faces), int(flip.sum())
+    out = np.where(flip[:, None], faces[:, ::-1], faces)
+    return out, int(flip.sum()), int(3 * n - 2 * len(pairs))
 
 
 # Heights.
