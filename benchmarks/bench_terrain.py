@@ -1,4 +1,4 @@
-"""Terrains from supports to the verdict: a table of how long each takes, and what fails.
+"""Terrains from supports to the verdict: how long each takes, and what fails.
 
     python examples/terrains/make.py terrains
     python benchmarks/bench_terrain.py terrains --only ramp --out table.md

@@ -718,8 +718,8 @@ def _supports(
 
         slope = math.acos(min(float(region.normal[2]), 1.0))
         if math.tan(slope) > friction:
-            text = f"{math.degrees(slope):.0f} degrees steep, friction {friction:g}"
-            reject(region.shape, f"{text} does not hold there")
+            text = f"too steep: {math.degrees(slope):.0f} degrees"
+            reject(region.shape, f"{text}, friction {friction:g}")
             continue
         if region.shape.buffer(-NARROW).is_empty:
             reject(region.shape, "too narrow")

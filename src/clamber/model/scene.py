@@ -394,6 +394,11 @@ class Scene:
         meshes = (s for m in self.meshes for s in m.supports)
         return (*(b.top for b in self.boxes), *meshes)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was mended in the files of meshes, a sentence each."""
+        return tuple(f"{m.name}: {note}" for m in self.meshes for note in m.notes)
+
     def owner(self, name: str) -> str:
         """The mesh that a support or a piece is of; else the name itself."""
         for m in self.meshes:
