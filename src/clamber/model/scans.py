@@ -16,9 +16,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from clamber.errors import InputError, check_kind, unreadable
-from clamber.model.boxes import to_z_up
+from clamber.model.boxes import grid_triangles, to_z_up
 from clamber.model.description import read_shapes
-from clamber.model.patches import merged, neighbours
+from clamber.model.regions import merged, neighbours
 from clamber.model.scene import MAX_LENGTH
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -252,12 +252,8 @@ def triangles_of_heights(
         raise InputError("heights in metres, or `scale`", path, "heights", value)
     rows, columns = heights.shape
     x, y = (np.linspace(-0.5, 0.5, n) for n in (columns, rows))
-    X, Y = np.meshgrid(size[0] * x, size[1] * y)
-    vertices = np.stack([X, Y, np.where(known, heights, 0.0)], axis=-1).reshape(-1, 3)
-    i = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]
-    halves = (a, b, d), (a, d, c)
-    faces = np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in halves])
+    flat = np.where(known, heights, 0.0)
+    vertices, faces = grid_triangles(size[0] * x, size[1] * y, flat)
     faces = faces[known.ravel()[faces].all(axis=1)]
     return mended(vertices, faces, path, notes)
 

@@ -12,7 +12,15 @@ import pydantic
 
 from clamber.errors import InputError, read_yaml, validated
 from clamber.model.arguments import checks_types
-from clamber.model.boxes import NAME, NoBox, read_described, read_obj, read_sdf
+from clamber.model.boxes import (
+    NAME,
+    Drawn,
+    NoBox,
+    Shape,
+    read_described,
+    read_obj,
+    read_sdf,
+)
 from clamber.model.description import read_xml
 from clamber.model.patches import mesh_of
 from clamber.model.scans import (
@@ -20,6 +28,7 @@ from clamber.model.scans import (
     MESHES,
     UNITS,
     check_size,
+    mended,
     read_heights,
     read_terrain,
     triangles_of_heights,
@@ -200,7 +209,9 @@ class SceneFile(_Strict):
         friction = self.ground.friction
         meshes = [m.mesh(folder) for m in (*self.meshes, *self.heightfields)]
         if isinstance(self.boxes, str):
-            boxes, drawn = read_boxes(folder / self.boxes, self.friction, self.up)
+            path = folder / self.boxes
+            (boxes, shapes), drawn = read_drawn(path, self.friction, self.up)
+            meshes += [_mesh_of_shape(s, path) for s in shapes]
             if drawn is not None and "friction" not in self.ground.model_fields_set:
                 friction = drawn
         else:
@@ -265,42 +276,50 @@ def _name_of(path: Path) -> str:
     return plain if re.match(NAME, plain) and plain != GROUND else "terrain"
 
 
-def read_boxes(
+def _mesh_of_shape(shape: Shape, path: Path) -> Mesh:
+    """The record; its faces may have been drawn any way round."""
+    triangles, notes = mended(shape.vertices, shape.faces, path)
+    return mesh_of(shape.name, *triangles, friction=shape.friction, notes=tuple(notes))
+
+
+def read_drawn(
     path: Path, friction: float, up: str | None = None
-) -> tuple[list[Box], float | None]:
-    """Boxes of a drawing, and the friction of the ground where it has one.
+) -> tuple[Drawn, float | None]:
+    """What is drawn in a file, and the friction of the ground where it has one.
 
     Args:
         path: The file.
-        friction: Of boxes of which it says none.
+        friction: Of shapes of which it says none.
         up: The axis that points up in an OBJ; None for z, unless it is plainly y.
 
     Raises:
-        InputError: It cannot be read, or a box of it cannot be used.
+        InputError: It cannot be read, or a shape of it cannot be used.
     """
-    ground = None
+    ground, shapes = None, []
     if path.suffix.lower() == ".obj":
         boxes = read_obj(path, up=up or "z", friction=friction)
         if up is None:
             _check_up(boxes, path)
     elif read_xml(path).tag == "sdf":
-        boxes = read_sdf(path, friction)
+        boxes, shapes = read_sdf(path, friction)
     else:
-        boxes, ground = read_described(path, friction)
-    names = [b.name for b in boxes]
-    for b in boxes:
+        (boxes, shapes), ground = read_described(path, friction)
+    names = [b.name for b in (*boxes, *shapes)]
+    for b in (*boxes, *shapes):
         fault = None
+        points = b.vertices if isinstance(b, Shape) else [b.size, b.position]
         if names.count(b.name) > 1 or b.name == GROUND or not re.match(NAME, b.name):
             fault = f"a name of its own of letters, digits and _, not {GROUND!r}"
-        elif max(np.abs(b.size).max(), np.abs(b.position).max()) > MAX_LENGTH:
+        elif np.abs(points).max() > MAX_LENGTH:
             fault = f"metres, at most {MAX_LENGTH:g}: is it in millimetres?"
         elif not 0 < b.friction <= 1:
             fault = f"a friction above 0, at most 1, not {b.friction:g}"
         if fault:
-            raise InputError(fault, path, f"box {b.name!r}")
+            kind = "shape" if isinstance(b, Shape) else "box"
+            raise InputError(fault, path, f"{kind} {b.name!r}")
     if ground is not None and not 0 < ground <= 1:
         raise InputError("a friction above 0, at most 1", path, "ground", ground)
-    return boxes, ground
+    return (boxes, shapes), ground
 
 
 def _check_up(boxes: list[Box], path: Path) -> None:
