@@ -5,7 +5,7 @@
 
 Each is a folder OUT/NN-kind with a mesh or a height map and its scene.yaml. The number
 is the seed: the same number is the same terrain. Every other seven are scans: what is
-seen from above at points 20 mm apart, with 5 mm of noise.
+seen from above at points 20 mm apart, with noise of up to 5 mm.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import trimesh
 import yaml
 from scipy.spatial import ConvexHull
 
-NOISE = 0.005  # [m] standard deviation, of each coordinate of a scan
+NOISE = 0.005  # [m] at most, of each coordinate of a scan
 SPACING = 0.020  # [m] of its points
 EDGE = 0.23  # [m] from the ankles to what is climbed
 WIDTH = 1.2  # [m]
@@ -195,7 +195,7 @@ def write_terrain(number: int, out: Path) -> Path:
     if scanned:
         x, y, heights = seen(solids)
         mesh = surface(x, y, heights)
-        noise = rng.normal(scale=NOISE, size=mesh.vertices.shape)
+        noise = rng.uniform(-NOISE, NOISE, size=mesh.vertices.shape)
         mesh.vertices = mesh.vertices + noise
     if scanned and number % 2:
         z = heights + noise[:, 2].reshape(heights.shape)
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     args = parser.parse_args()
     for number in range(args.first, args.first + args.count):
-        print(write_terrain(number, args.out))  # noqa: T201
+        print(write_terrain(number, args.out))
 
 
 if __name__ == "__main__":

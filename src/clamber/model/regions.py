@@ -292,7 +292,7 @@ def _regions(
         math.cos(turn),
     )
     label = _joined(vertices, faces, normals, areas, pairs, label, reach)
-    ragged = reach if turn > TURN else 0.0
+    ragged = ROUGHEST if turn > TURN else 0.0
     return _bordered(vertices, faces, normals, areas, pairs, edge, label, part, ragged)
 
 
