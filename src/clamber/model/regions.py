@@ -30,8 +30,10 @@ ROUGHEST = 0.010  # [m] ... of any mesh
 SIGMAS = 3.0  # of the noise, that a triangle may be off
 TURN = math.radians(18.0)  # between a triangle's normal and its region's
 NOISY_TURN = math.radians(32.0)  # ... where there is noise
-CELL = 0.020  # [m] a noisy mesh is not looked at more finely
+CELL = 0.020  # [m] a noisy mesh that is finer is put together to this
 ROUNDS = 8  # of smoothing what is noisy
+ALIKE = 0.35  # square of the distance of normals that are alike
+BLURRED = 0.5  # ... of a mesh that was put together
 FINE = 0.06  # [m] longer edges say nothing of noise
 SMALL = 1.5e-3  # [m^2] a smaller region joins one beside it, where it can
 BORDER = 0.006  # [m] by which borders are straightened
@@ -101,16 +103,17 @@ def find_regions(
     """
     beside = neighbours(faces, vertices)
     reach, turn = _evenness(vertices, faces, *beside)
+    alike = ALIKE
     if turn > TURN:
-        if _median_edge(vertices, faces) < CELL:
+        if _median_edge(vertices, faces) < 0.9 * CELL:
             vertices, faces = merged(vertices, faces, CELL)
-            beside = neighbours(faces)
-        vertices = _denoised(vertices, faces, beside[0])
+            beside, alike = neighbours(faces), BLURRED
+        vertices = _denoised(vertices, faces, beside[0], alike)
     n = len(faces)
     links = coo_array((np.ones(len(beside[0])), tuple(beside[0].T)), shape=(n, n))
     part = connected_components(links, directed=False)[1]
     surface = Surface(vertices=vertices, faces=faces, pairs=beside[0], part=part)
-    return surface, _regions(vertices, faces, *beside, part, reach, turn)
+    return surface, _regions(vertices, faces, *beside, part, reach, turn, alike)
 
 
 def neighbours(
@@ -199,15 +202,19 @@ def _evenness(
 
 
 def _smoothed(
-    normals: np.ndarray, areas: np.ndarray, pairs: np.ndarray, rounds: int
+    normals: np.ndarray,
+    areas: np.ndarray,
+    pairs: np.ndarray,
+    rounds: int,
+    alike: float,
 ) -> np.ndarray:
     """Normals averaged with those of neighbours that are alike."""
     a, b = pairs.T
     for _ in range(rounds):
-        alike = np.exp(-np.sum((normals[a] - normals[b]) ** 2, axis=1) / 0.5)
+        share = np.exp(-np.sum((normals[a] - normals[b]) ** 2, axis=1) / alike)
         out = normals * areas[:, None]
         for one, other in ((a, b), (b, a)):
-            weight = alike * areas[other]
+            weight = share * areas[other]
             for k in range(3):
                 out[:, k] += np.bincount(one, weight * normals[other, k], len(normals))
         normals = out / np.maximum(np.linalg.norm(out, axis=1), 1e-300)[:, None]
@@ -243,10 +250,12 @@ def merged(
     return np.stack(out, axis=1), faces[np.sort(first)]
 
 
-def _denoised(vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def _denoised(
+    vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, alike: float
+) -> np.ndarray:
     """Vertices moved so that triangles have the normals that are smoothed."""
     normals, areas = _normals(vertices, faces)
-    soft = _smoothed(normals, areas, pairs, ROUNDS)
+    soft = _smoothed(normals, areas, pairs, ROUNDS, alike)
     count = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
     for _ in range(ROUNDS):
         centre = vertices[faces].mean(axis=1)
@@ -268,11 +277,12 @@ def _regions(
     part: np.ndarray,
     reach: float,
     turn: float,
+    alike: float,
 ) -> list[Region]:
     """Planar regions, in the order in which they were found: the flattest first."""
     normals, areas = _normals(vertices, faces)
     n = len(faces)
-    soft = _smoothed(normals, areas, pairs, 4 if turn > TURN else 0)
+    soft = _smoothed(normals, areas, pairs, 4 if turn > TURN else 0, alike)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     bend = 1.0 - np.sum(soft[ends[:, 0]] * soft[ends[:, 1]], axis=1)
     bent = np.bincount(ends[:, 0], bend, n) / np.maximum(
