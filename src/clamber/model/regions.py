@@ -32,8 +32,8 @@ TURN = math.radians(18.0)  # between a triangle's normal and its region's
 NOISY_TURN = math.radians(32.0)  # ... where there is noise
 CELL = 0.020  # [m] a noisy mesh that is finer is put together to this
 ROUNDS = 8  # of smoothing what is noisy
-ALIKE = 0.35  # square of the distance of normals that are alike
-BLURRED = 0.5  # ... of a mesh that was put together
+ALIKE = 0.2  # square of the distance of normals that are alike
+BLURRED = 0.5  # ... under the most noise
 FINE = 0.06  # [m] longer edges say nothing of noise
 SMALL = 1.5e-3  # [m^2] a smaller region joins one beside it, where it can
 BORDER = 0.006  # [m] by which borders are straightened
@@ -103,7 +103,7 @@ def find_regions(
     """
     beside = neighbours(faces, vertices)
     reach, turn = _evenness(vertices, faces, *beside)
-    alike = ALIKE
+    alike = ALIKE if reach < ROUGHEST else BLURRED
     if turn > TURN:
         if _median_edge(vertices, faces) < 0.9 * CELL:
             vertices, faces = merged(vertices, faces, CELL)
