@@ -31,6 +31,7 @@ from clamber.execution.executive import (
     MASS_CHANGE,
     SEARCHES,
     START_DRIFT,
+    SEARCHING,
     THINKING,
     Executive,
     OpenLoop,
@@ -193,9 +194,10 @@ def test_the_hand_stops_where_it_touches(hands_plan, other_height):
     assert LOOK + THINKING - 0.01 < wait < RAMP + LOOK + THINKING + 0.01
     n = round((LOOK + THINKING) / PHYSICS_STEP)
     k = round(again.time / PHYSICS_STEP) - n
-    q = rollout.followed.q[k : k + n]
+    q = rollout.followed.q[k + 5 : k + n - 5]
     assert np.all(q == q[0])
-    assert not rollout.followed.v[k + 1 : k + n].any()
+    assert not rollout.followed.v[k + 5 : k + n - 5].any()
+    k = round(event.time / PHYSICS_STEP)
     p = point_at(rollout, event.time + 0.1, "LHand")
     assert p[2] == pytest.approx(TOP + height, abs=2e-3)
     # It is measured between two recorded states.
@@ -477,8 +479,9 @@ def test_where_no_other_plan_is_found_the_one_at_hand_may_do(
     told.to(touch, LHand=50.0)
     assert kinds(told.events) == [ContactMoved]
     assert told.events[0].made
-    q = told.executive.reference.copy()
     told.until(2)
+    q = told.executive.reference.copy()
+    told.tick()
     assert np.array_equal(told.executive.reference[7:], q[7:]) or share < 1
     assert kinds(told.events[1:]) == [KeptPlan if share < 1 else Stopped]
     assert told.executive.stopped == ("" if share < 1 else "no way")
@@ -557,7 +560,7 @@ def test_a_policy_followed_anew_reaches_the_keyframes_of_the_plan(
     told.trajectory, told.k, told.moves, told.up = t, 299, True, 0.0
     told.finish()
     assert told.executive.stopped == ""
-    before = replanned - round((LOOK + THINKING) / PHYSICS_STEP)
+    before = replanned - round((RAMP + LOOK + SEARCHING) / PHYSICS_STEP)
     ends = replanned + np.array([end_of(found, i) for i in range(len(again))]) - 299
     steps = np.array([0, before, *ends])
     reached = told.executive.followed.keyframes / PHYSICS_STEP
@@ -577,7 +580,9 @@ def test_a_contact_that_carries_nothing_is_probed_for_again(fast_plan, found):
         force = told.scales()
         if told.k > touch + 50:
             there = found and below > 0.5 * DEVIATION
+            weight = force[:, 2].sum()
             force[hand] = [0.0, 0.0, 30.0] if there else 0.0
+            force *= weight / force[:, 2].sum()  # the others bear the rest
             low = max(low, below)
         told.tick(force=force)
         since += found and low > 0.5 * DEVIATION
@@ -591,7 +596,7 @@ def test_a_contact_that_carries_nothing_is_probed_for_again(fast_plan, found):
     if found:
         return
     # The hand is no part of the stance any more, nor of what is believed of the box.
-    told.until(3, force=told.scales(LHand=0.0))
+    told.until(3, force=force)
     assert kinds(told.events[2:]) in ([Replanned], [Stopped])
     if told.executive.stopped == "":
         assert "LHand" not in {c.surface for c in told.executive.stance}
@@ -612,6 +617,8 @@ def test_all_surfaces_that_are_loaded_at_the_end_are_rested_on(fast_plan):
 
 def test_ankles_position_themselves_while_both_arms_are_loaded(fast_plan):
     """Then their command goes with the measured angle: a deviation is let alone."""
+    slow = timed(fast_plan.world, fast_plan.changes, 0.3)
+    fast_plan = replace(fast_plan, trajectory=slow)
     told, w = Told(fast_plan), fast_plan.world
     feet = self_positioning_joints(w)
     off = np.where(np.any(list(feet.values()), axis=0), 0.01, 0.0)

@@ -107,6 +107,7 @@ class ClimbCommand:
                 done = self.execution.simulate(plan, folder, report, None)
         usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
         self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
+        self.output.warn(*scene.notes)
         code = conclude(self.output, folder, plan, done, clock)
         shown = {"demonstration": (demo, sequence), "with_video": self.video}
         _draw(self.output, folder, clock, track, **shown)
