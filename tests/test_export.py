@@ -332,7 +332,8 @@ def test_a_base_that_execution_moved_gets_its_velocity_from_its_poses(
     plan: Plan, tmp_path: Path
 ):
     """With contacts felt, what was followed has velocities of joints only."""
-    felt = clamber.simulate(plan, controller="mixed")
+    lower = clamber.Disturbance(height=-0.02)
+    felt = clamber.simulate(plan, controller="mixed", disturbance=lower)
     assert felt.followed is not None
     save_plan(plan, tmp_path)
     save_rollout(plan, felt, tmp_path)
