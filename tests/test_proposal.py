@@ -63,6 +63,15 @@ def proposed(request, tmp_path_factory):
     return proposal, robot, build_world(robot, Scene(start=np.zeros(3)))
 
 
+def test_what_is_being_done_is_said_in_order(tmp_path):
+    seen = []
+    propose_robot(described(tmp_path, "mjcf"), progress=lambda *x: seen.append(x))
+    assert {stage for stage, _, _ in seen} == {"robot"}
+    shares = [share for _, share, _ in seen]
+    assert shares == sorted(set(shares))
+    assert len(seen) >= 5
+
+
 LIMBS = {
     "mjcf": {
         "left_arm": ("v1", "v2"),

@@ -50,7 +50,7 @@ from clamber.cli.output import (
     replanned_record,
     skipped_tables,
 )
-from clamber.cli.progress import Report, Track
+from clamber.cli.progress import Track
 from clamber.cli.tools import (
     DRAWING,
     ExportCommand,
@@ -62,6 +62,7 @@ from clamber.cli.tools import (
     ViewCommand,
 )
 from clamber.errors import ClamberError, InputError
+from clamber.model.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -478,7 +479,7 @@ def _plan(
     scene: clamber.Scene,
     flags: PlanningFlags,
     folder: Path,
-    report: Report,
+    report: Progress,
     others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
     """Plan and save; `others`: how others are looked for where the shown ones fail."""

@@ -21,8 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 import clamber
-from clamber.cli.progress import Report, Track, bar, lines
+from clamber.cli.progress import Track, bar, lines
 from clamber.execution.events import event_fields
+from clamber.model.progress import Progress
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: success (or the command did its work), failure, bad
@@ -41,7 +42,7 @@ class Output:
     """No progress, no table: files and exit code only."""
 
     @contextlib.contextmanager
-    def progress(self, track: Track, *, more: bool = False) -> Iterator[Report]:
+    def progress(self, track: Track, *, more: bool = False) -> Iterator[Progress]:
         """Yield `report(stage, share done, note)`; it draws on stderr.
 
         Args:
@@ -113,9 +114,9 @@ class Clock:
     def __init__(self) -> None:
         """Nothing has run yet."""
         self._stages: dict[str, float] = {}
-        self._moves: list[tuple[str, float]] = []
+        self._moves: dict[str, float] = {}
 
-    def watching(self, report: Report) -> Report:
+    def watching(self, report: Progress) -> Progress:
         """A report that also takes the time."""
         began: dict[tuple[str, float, str], float] = {}
         last: tuple[str, float, str] | None = None
@@ -127,20 +128,15 @@ class Clock:
                 spent = now - began[last]
                 self._stages[last[0]] = self._stages.get(last[0], 0.0) + spent
                 if last[0] == "plan":
-                    self._add(last, spent)
+                    # A move that is tried again, for a later one's sake or with
+                    # other weights, costs all of that.
+                    move = last[2].rpartition(": ")[2]
+                    self._moves[move] = self._moves.get(move, 0.0) + spent
             last = (stage, done, note)
             began[last] = now
             report(stage, done, note)
 
         return timed
-
-    def _add(self, step: tuple[str, float, str], spent: float) -> None:
-        """A move that is tried again, for a later one's sake, costs both times."""
-        for i, (note, seconds) in enumerate(self._moves):
-            if note == step[2]:
-                self._moves[i] = (note, seconds + spent)
-                return
-        self._moves.append((step[2], spent))
 
     def stages(self) -> dict[str, float]:
         """Seconds by stage."""
@@ -148,7 +144,7 @@ class Clock:
 
     def of(self, move: object) -> float | None:
         """Seconds that a move took; None where it was not watched."""
-        return dict(self._moves).get(str(move))
+        return self._moves.get(str(move))
 
 
 def new_table(*columns: str, numbers: bool = False) -> Table:

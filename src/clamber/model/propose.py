@@ -29,6 +29,7 @@ from clamber.model.description import (
 )
 from clamber.model.facing import said_of_ahead
 from clamber.model.limbs import Anatomy, find_limbs
+from clamber.model.progress import Progress, silent
 from clamber.model.records import short_repr
 from clamber.model.se3 import (
     quat_from_matrix,
@@ -105,7 +106,10 @@ class Proposal:
 
 @checks_types
 def propose_robot(
-    path: str | Path, *, effort_from: str | Path | None = None
+    path: str | Path,
+    *,
+    effort_from: str | Path | None = None,
+    progress: Progress = silent,
 ) -> Proposal:
     """Propose limbs, surfaces, nominal posture, limits and gains of a description.
 
@@ -114,6 +118,7 @@ def propose_robot(
             see `clamber.model.wheels`.
         effort_from: Where effort limits are that this description lacks: another
             description with the same joint names, or a YAML mapping of joints to N m.
+        progress: Called with stage, share and note.
 
     Raises:
         InputError: It cannot be read, or is no humanoid; see `find_limbs`.
@@ -123,14 +128,18 @@ def propose_robot(
         path, limits = _from_wheel(str(path))
         effort_from = effort_from or limits
     path = Path(path)
+    progress("robot", 0.0, f"reading {path}")
     description = read_description(path, lenient=True)
+    progress("robot", 0.2, "limbs")
     tree, found, notes = _upright(description, path)
     notes += _driven(tree, found, description.mimics, path)
+    progress("robot", 0.4, "shapes of its links")
     shapes, more = link_shapes(tree)
     notes += more
     shapes, limbs = with_surfaces(tree, found, shapes)
     known = {} if effort_from is None else _known_efforts(Path(effort_from))
     effort, guessed = _efforts(tree, found, known)
+    progress("robot", 0.5, "nominal posture")
     home = nominal_posture(tree, found, effort)
     if guessed:
         notes.append(
@@ -159,6 +168,7 @@ def propose_robot(
             f"a hand supports {bears:.0f} N across its wrist: too little for compliant"
             " (self-positioning) ankles, so they stay stiff"
         )
+    progress("robot", 0.6, "its model")
     spec, files = build_spec(name, tree, found, shapes, apart, drives)
     spec.compile()
     return Proposal(
