@@ -296,6 +296,8 @@ def conclude(
     plan: clamber.Plan,
     done: tuple[clamber.Rollout, clamber.Verdict] | None,
     clock: Clock | None = None,
+    *,
+    drawn: bool = True,
 ) -> int:
     """Show the verdict and where the files are; the exit code says the same."""
     table = new_table("criterion", "value", "limit", "")
@@ -333,5 +335,8 @@ def conclude(
             felt.add_row(f"{e.time:.2f}", str(e))
         tables.append(felt)
     tables += [table] if criteria else []
-    output.show(record, *tables, note=closing(note, folder, reached))
+    note = closing(note, folder, reached)
+    if reached and not drawn:
+        note += f"; `clamber render {folder}` draws it"
+    output.show(record, *tables, note=note)
     return REACHED if reached else MISSED
