@@ -134,7 +134,14 @@ def load_scene(path: SceneLike) -> Scene:
         expected = f"a scene.yaml, or boxes as {', '.join(DRAWN)}: export it as OBJ"
         raise InputError(expected, path)
     content = {"boxes": path.name} if drawn else read_yaml(path)
-    return validated(SceneFile, content, path).scene(path.parent)
+    file = validated(SceneFile, content, path)
+    try:
+        return file.scene(path.parent)
+    except InputError as e:
+        if drawn or not isinstance(file.boxes, str):
+            raise
+        source = path if e.source is None else f"{path}, {e.source}"
+        raise InputError(e.expected, source, e.field, e.value) from e
 
 
 def read_boxes(
