@@ -38,6 +38,7 @@ from clamber.model.se3 import (
     rotation_vector,
 )
 from clamber.model.shapes import (
+    MAX_FRICTION,
     Shape,
     build_spec,
     link_shapes,
@@ -158,6 +159,7 @@ def propose_robot(
     if thin:
         notes.append(f"thinner, for room beside other links: {', '.join(thin)}")
     gains, drives, impedance = _gains(tree, found, effort)
+    notes += _braked(tree, found)
     bears = _hand_load(tree, found, shapes, effort)
     ankles = []
     if bears >= HAND_SHARE * float(tree.model.body_subtreemass[found.base]) * 9.81:
@@ -588,6 +590,22 @@ def _two_digits(x: float) -> float:
     return float(f"{x:.2g}")
 
 
+def _braked(tree: Tree, found: Anatomy) -> list[str]:
+    """What is said where joints of the description are braked more than joints are."""
+    model, dofs = tree.model, tree.model.jnt_dofadr[list(found.moving)]
+    brakes = (
+        (model.dof_damping[dofs], MAX_DAMPING, "N m s/rad of damping"),
+        (model.dof_frictionloss[dofs], MAX_FRICTION, "N m of dry friction"),
+        (model.dof_armature[dofs], MAX_ARMATURE, "kg m^2 of armature"),
+    )
+    return [
+        f"{(values > most).sum()} joints of the description have up to"
+        f" {values.max():g} {unit}, as simulations do: {most:g} are taken"
+        for values, most, unit in brakes
+        if values.max() > most
+    ]
+
+
 def _gains(
     tree: Tree, found: Anatomy, effort: Mapping[str, float]
 ) -> tuple[dict, dict[int, tuple[float, float]], dict]:
@@ -615,10 +633,9 @@ def _gains(
             light_armature, light_damping = WEAK_ARMATURE, WEAK_DAMPING
         if armature <= 0:
             armature = _two_digits(ARMATURE * inertia * light_armature)
-            armature = min(armature, MAX_ARMATURE)
         if damping <= 0:
-            damping = min(_two_digits(DAMPING * inertia * light_damping), MAX_DAMPING)
-        drives[j] = (armature, damping)
+            damping = _two_digits(DAMPING * inertia * light_damping)
+        drives[j] = (min(armature, MAX_ARMATURE), min(damping, MAX_DAMPING))
     soft = [c.elbow for c in found.limbs.values()]
     soft += [j for j in found.trunk if abs(float(data.xaxis[j, 1])) < 0.7]
     compliant = rounded(kp=COMPLIANT_KP * kp, kd=COMPLIANT_KD * kd)
