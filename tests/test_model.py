@@ -14,7 +14,7 @@ from clamber.model.kinematics import Kinematics, limb_lengths
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import GROUND, Box, Scene
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
-from clamber.model.world import World, build_world, recompiled
+from clamber.model.world import World, _pairs, build_world, recompiled
 from clamber.step.stability import rolled_to
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -804,6 +804,20 @@ def test_turning_on_the_spot_rolls_nowhere_and_flat_surfaces_never_roll(kin):
     for c in (foot, replace(touching(kin, "LKnee"), link=None)):
         (there,) = rolled_to(kin, [c], random_posture(world, 0))
         np.testing.assert_array_equal(there.position, 0.0)
+
+
+@pytest.mark.parametrize("hinges", [2, 3])
+def test_neighbours_on_three_hinges_in_one_place_can_meet_and_others_cannot(hinges):
+    axes = ("1 0 0", "0 1 0", "0 0 1")[:hinges]
+    joints = "".join(f'<joint axis="{a}"/>' for a in axes)
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody><body name="base">
+      <freejoint/><geom size=".1"/><body pos="0 0 .25">{joints}<geom size=".1"/>
+      <body pos="0 0 .25"><joint/><geom size=".1"/></body></body></body>
+      </worldbody></mujoco>""")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    pairs = _pairs(model, data, model.body("base").id).tolist()
+    assert pairs == [[0, 1], [0, 2]][3 - hinges :]
 
 
 # Landmarks.

@@ -290,6 +290,17 @@ def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
     return [options, pelvis]
 
 
+def _strained(rollout: clamber.Rollout) -> str:
+    """Which joint may be too weak; empty where none was at its limit."""
+    from clamber.execution.verdict import strained_joint
+
+    found = strained_joint(rollout)
+    if found is None:
+        return ""
+    name, limit, seconds = found
+    return f"; {name} was at its effort limit of {limit:g} N m for {seconds:.1f} s"
+
+
 def conclude(
     output: Output,
     folder: Path,
@@ -327,6 +338,8 @@ def conclude(
     else:
         wrong = [n for n, c in criteria.items() if not c.ok]
         note = f"failed: {', '.join(wrong) or 'nothing was planned'}"
+    if rollout is not None and not reached:
+        note += _strained(rollout)
     tables = keyframe_tables(planned) if clock is not None else []
     tables += skipped_tables(plan)
     if rollout is not None and rollout.events:

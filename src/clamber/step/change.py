@@ -24,7 +24,7 @@ from clamber.step.posture import (
     finish,
     orientation_at,
 )
-from clamber.step.stability import limiting_joint, rolled_to
+from clamber.step.stability import limiting_joint, out_of_reach, rolled_to
 from clamber.step.tasks import support_rotation
 from clamber.step.transition import (
     MARGINS,
@@ -252,6 +252,9 @@ def _change(
         detail = ""
         if key.status is Status.OVERLOADED:
             detail = limiting_joint(ik.kin, key.q, key.stance)
+        elif key.status is Status.UNREACHABLE and step.makes is not None:
+            pair = key.residuals.worst_pair
+            detail = out_of_reach(ik.kin, key.q, step.makes, pair)
         return Failure(status=key.status, step=step, detail=detail)
     status, detail = key.status, ""
     for margin in MARGINS:

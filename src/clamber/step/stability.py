@@ -17,7 +17,7 @@ from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.world import World
+from clamber.model.world import World, limb_links
 from clamber.step.statics import (
     ContactPoints,
     Load,
@@ -34,6 +34,9 @@ from clamber.step.statics import (
 from clamber.step.tasks import packed_contacts
 
 EFFORT_SHARE: float = _core.EFFORT_SHARE  # of the effort limits, for holding
+MISSED = 0.001  # [m] a surface that stays as far from its support has not reached it
+STRETCHED = 0.99  # of a limb's length, from root to end
+AT_LIMIT = 0.01  # [rad] a joint that is nearer to its limit is at it
 STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
 
 
@@ -157,6 +160,40 @@ def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
         f" {share * counted:.1f} N m; {counted:.1f} N m of its limit of"
         f" {float(kin.world.tau_max[j]):g} N m are available to the planner"
     )
+
+
+def out_of_reach(kin: Kinematics, q: np.ndarray, c: Contact, pair: int = -1) -> str:
+    """Why a contact cannot be made, as far as the best posture `q` (nq,) tells.
+
+    How far its surface stays from its support, whether its limb is stretched, which of
+    its joints are at a limit, and which two shapes cannot come nearer.
+
+    Args:
+        kin: Workspace.
+        q: The posture.
+        c: The contact.
+        pair: Of shapes that are as near as they may be; -1: none.
+    """
+    w = kin.world
+    kin.update(q)
+    support, limb = w.supports[c.support], w.robot.limb_of(c.surface)
+    p = kin.contact_point(c.surface, support.normal)
+    away = float(np.linalg.norm(p - support.nearest(p)))
+    said = [f"stays {1e3 * away:.0f} mm from {c.support}"] if away >= MISSED else []
+    a, b, end = (kin.landmark(x)[1] for x in (limb.root, limb.middle, limb.end))
+    length = float(np.linalg.norm(b - a) + np.linalg.norm(end - b))
+    if float(np.linalg.norm(end - a)) > STRETCHED * length:
+        said.append(f"the {limb.name.replace('_', ' ')}, {length:.2f} m, is stretched")
+    links, m = limb_links(w, c.surface), w.model
+    room = np.minimum(q[w.qadr] - w.q_min[w.dadr], w.q_max[w.dadr] - q[w.qadr])
+    mine = np.isin(m.dof_bodyid[w.dadr], list(links))
+    ends = [w.joints[i] for i in np.flatnonzero(mine & (room < AT_LIMIT))]
+    said += [f"{', '.join(ends)} at a limit"] if ends else []
+    if pair >= 0:
+        shapes = (m.geom(int(g)).name for g in w.pairs[pair])
+        said.append(f"{' and '.join(shapes)} keep their distance")
+    why = ", ".join(said)
+    return f"{Status.UNREACHABLE.value} ({c.surface}: {why})" if why else ""
 
 
 def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> float:
