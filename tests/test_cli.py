@@ -26,7 +26,9 @@ import pytest
 import clamber
 from clamber import cli
 from clamber.cli import flags, output, tools
+from clamber.cli.output import closing
 from clamber.execution.verdict import Figure, judge
+from clamber.planning.records import Fallback
 from conftest import ROOT
 from support.files import write_take
 
@@ -312,7 +314,7 @@ def quick_climb(one_hand_plan, one_hand_rollout, monkeypatch: Patch) -> SimpleNa
         said.drawing = options
         if said.no_opengl:
             raise clamber.ClamberError("no OpenGL")
-        return []
+        return [args[0] / "climb.png"]
 
     for name in ("save_sequence", "save_plan", "save_rollout", "save_verdict"):
         note(name, getattr(clamber, name))
@@ -328,10 +330,12 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
 ):
     words = ["climb", "--height", "0.25", "--video"]
     cli.main([*words, "--out", str(tmp_path / "a")])
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
     saved = ["save_sequence", "plan", "save_plan", "simulate", "save_rollout", "judge"]
     assert quick_climb.calls == [*saved, "save_verdict", "render_run"]
     assert "with_video" not in quick_climb.drawing  # all of it
+    look = f"{tmp_path / 'a' / 'climb.png'} shows it; `clamber report {tmp_path / 'a'}`"
+    assert err.splitlines()[-1].startswith(look)
     row = next(r for r in out.splitlines() if r.startswith("air -> LHand on box"))
     key = quick_climb.plan.keyframes[-1]
     for value in (
@@ -421,7 +425,7 @@ MISTAKES = {
     "climb --demo unit.yaml": ("unit", "'ell'"),
     "climb --scene no.yaml": ("no.yaml: expected a readable file", "check the path"),
     "climb --scene tab.yaml": ("tab.yaml: expected YAML", "line 2"),
-    "climb --scene field.yaml": ("boxes.0.colour", "mend its name, or leave it out"),
+    "climb --scene field.yaml": ("boxes.0.colour", "correct its name, or leave it out"),
     "climb --scene inside.yaml": ("start is", "move the one or the other"),
     "climb --speed 0": ("--speed is 0.0", "expected a joint speed of at least"),
     "climb --disturb.friction 7": ("--disturb.friction is 7.0", "from 0.01 to 1"),
@@ -646,3 +650,17 @@ def test_a_sweep_with_a_robot_that_is_not_there_runs_nothing(
     assert cli.main(["sweep", str(spec), "--out", str(out)]) == output.BAD_INPUT
     assert "nobody" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_success_that_is_not_as_demonstrated_ends_with_the_success(one_hand_plan):
+    fallback = Fallback(
+        reason="no stable plan as demonstrated (LHand -> air: too far)",
+        source="alternatives",
+        surfaces=("LElbow",),
+    )
+    made = replace(one_hand_plan, fallback=fallback, complete=True)
+    said = closing("success: it is there", Path("runs/x"), True, made).splitlines()
+    assert said[0].startswith("note: no stable plan as demonstrated (LHand")
+    assert said[0].endswith("instead, of the alternatives: LElbow")
+    assert said[1:] == ["success: it is there; the files are in runs/x"]
+    assert closing("done", Path("x"), True, one_hand_plan).count("\n") == 0

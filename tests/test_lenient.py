@@ -118,7 +118,7 @@ def no_rate(x: list[str]) -> list[str]:
         (count("NumFrames", "41"), "NumFrames says 41, the file has 40 rows"),
         (count("NumFrames", "7"), "NumFrames says 7, the file has 40 rows"),
         (count("NumMarkers", "20"), "NumMarkers says 20, the file has 21 names"),
-        (count("Units", "furlong"), "'furlong' is no unit of length, not heeded"),
+        (count("Units", "furlong"), "'furlong' is no unit of length: ignored"),
         (count("Units", "[mm]"), None), (count("Units", "Millimeters"), None),
         (no_rate, "30 Hz by the times"),
     ],

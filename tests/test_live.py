@@ -16,20 +16,33 @@ import pytest
 
 import clamber
 from clamber import cli
+from clamber.contact.contact import region_of
 from clamber.errors import InputError, MissingDependency
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
-from clamber.show import editor
+from clamber.show import editor, scene3d
 from clamber.show.editor import Edits
 from clamber.show.live import open_view
 from clamber.show.page import Clock, paragraphs
-from clamber.show.sample import keyframe_times
-from clamber.show.skeleton import paired_times, skeleton_of, to_the_right
+from clamber.show.sample import keyframe_times, sample_motion
+from clamber.show.skeleton import (
+    Skeleton,
+    paired_times,
+    skeleton_of,
+    to_the_right,
+)
+from test_gait import POLICY
 
 NASTY = "<img src=x onerror=alert(1)>"
 
 
 # The person.
+
+
+@pytest.fixture(scope="module")
+def climber() -> Skeleton:
+    demo = clamber.load_demo("climb")
+    return skeleton_of(demo, clamber.detect_contacts(demo))
 
 
 def test_a_skeleton_stands_where_it_was_recorded(demo_sequence: Any):
@@ -58,12 +71,53 @@ def test_what_is_put_to_the_right_leaves_a_gap_between_the_boxes():
     assert way[0] == pytest.approx(0.0)
 
 
-def test_the_person_makes_its_contacts_when_the_robot_does(one_hand_plan: Plan):
+def test_the_person_makes_its_contacts_when_the_robot_does(
+    one_hand_plan: Plan, climber: Skeleton
+):
     reached = keyframe_times(one_hand_plan, None)
-    robot, person = paired_times(one_hand_plan, reached, 99.0)
+    robot, person = paired_times(one_hand_plan, reached, 99.0, climber)
     assert np.interp(reached[1] or 0.0, robot, person) == pytest.approx(1.0)
     assert np.all(np.diff(robot) > 0)
     assert np.all(np.diff(person) >= 0)
+
+
+def test_by_a_policy_robot_and_person_come_onto_the_box_at_the_same_time(
+    demo_plan: Plan, climber: Skeleton
+):
+    assert climber.sequence is not None
+    own = demo_plan.sequence.t  # of a plan by a policy, no time of the person's
+    invented = replace(demo_plan.sequence, t=np.arange(float(len(own))))
+    plan = replace(demo_plan, policy=POLICY, sequence=invented)
+    reached = [100.0 + 10.0 * i for i in range(len(plan.keyframes))]
+    reached[0] = 0.0
+    began = list(climber.sequence.t[:-1])
+    regions = [s.region for s in climber.sequence.stances]
+    mine = [region_of(k.stance) for k in plan.keyframes]
+    robot, person = paired_times(plan, [*reached], 999.0, climber)
+    for region in ("M", "O"):
+        at, t = reached[mine.index(region)], began[regions.index(region)]
+        assert np.interp(at, robot, person) == pytest.approx(t)
+    assert np.interp(999.0, robot, person) == climber.sequence.t[-1]
+    # A robot that never comes wholly on top: nor does the person.
+    stuck = [t if r != "O" else None for t, r in zip(reached, mine, strict=True)]
+    robot, person = paired_times(plan, stuck, 999.0, climber)
+    assert person[-1] == pytest.approx(began[regions.index("O")])
+
+
+def test_a_long_run_is_sampled_no_finer_than_it_can_be_opened_at_once(
+    whole: Path, monkeypatch: pytest.MonkeyPatch
+):
+    sampled = []
+
+    def noted(*args: Any) -> Any:
+        sampled.append(sample_motion(*args))
+        return sampled[-1]
+
+    monkeypatch.setattr(scene3d, "MOST", 20)
+    monkeypatch.setattr(scene3d, "sample_motion", noted)
+    page = open_view(whole, port=18090)
+    page.close()
+    assert [len(m.time) <= 20 for m in sampled] == [True]
 
 
 # Edits.

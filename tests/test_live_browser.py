@@ -18,6 +18,7 @@ from PIL import Image
 import clamber
 from clamber.execution.simulation import Rollout
 from clamber.planning.records import Plan
+from clamber.show.chart import COLOURS
 from clamber.show.live import LAYERS, PERSON_LAYER
 from clamber.show.renderer import PRESETS
 from clamber.show.scene3d import BEFORE_EDITING
@@ -241,7 +242,7 @@ def handed_out(view: Opened, button: str, *endings: str) -> bytes:
 
 
 def test_report_and_picture_are_handed_out(view: Opened):
-    view.folder("Take away")
+    view.folder("Export")
     assert b"<!DOCTYPE html>" in handed_out(
         view, "Report: plots, tables, criteria", ".html"
     )
@@ -249,13 +250,13 @@ def test_report_and_picture_are_handed_out(view: Opened):
     seen = np.asarray(picture.convert("RGB")).astype(int)
     assert picture.mode == "RGBA"  # on nothing
     assert np.sum(orange_in(seen)) > ENOUGH
-    view.folder("Take away")
+    view.folder("Export")
 
 
 @pytest.mark.slow
 def test_a_video_is_handed_out(browser: Any, off_plan: Path):
     with served(browser, off_plan) as view:
-        view.folder("Take away")
+        view.folder("Export")
         view.tab.set_default_timeout(300_000)
         video = handed_out(view, "Video", ".mp4", ".webp")
         assert video[:4] == b"RIFF" or video[4:8] == b"ftyp"  # WebP, or MP4
@@ -296,6 +297,10 @@ def test_values_are_read_off_a_plot_and_the_present_is_marked(view: Opened):
     first = tab.evaluate(marks)
     page.clock.go(page.clock.end)
     view.until(lambda: tab.evaluate(marks) > first, "a mark that has moved")
+    drawn = view.picture({k: round(v) for k, v in box.items()})
+    for colour in (COLOURS[4], COLOURS[6]):  # of the feet
+        rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert np.sum(np.abs(drawn - rgb).max(axis=2) < 40) > 30, colour
     view.folder("Over time")
 
 

@@ -67,8 +67,8 @@ def test_what_is_chosen_is_climbed_and_the_run_opens(
         view.click("Climb")
         view.tab.wait_for_selector('text="speed"')
         assert asked == [Climb(robot="coman", height=0.275)]
-        told(view, "did not make it")  # the verdict of the run
-        told(view, "It did not: fell.")
+        told(view, "failed")  # the verdict of the run
+        told(view, "Failed: fell.")
         told(view, "clamber climb --robot coman --height 0.275")
         view.until(lambda: view.orange() > ENOUGH, "the robot of the run")
         assert (here / "runs" / "climb" / "plan.json").is_file()

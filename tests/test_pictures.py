@@ -542,7 +542,7 @@ def test_the_person_is_beside_the_robot_in_a_video_and_called_synthetic(
     assert who.name == "person (synthetic)"
 
 
-def test_the_person_is_whom_the_plan_names_and_nobody_where_a_policy_is_followed(
+def test_the_person_is_whom_the_plan_goes_back_to_by_way_of_a_policy_too(
     plan: Plan,
 ):
     shown = replace(plan, sequence=replace(plan.sequence, source=source_of("climb")))
@@ -550,7 +550,7 @@ def test_the_person_is_whom_the_plan_names_and_nobody_where_a_policy_is_followed
     assert person is not None
     assert person.demo.synthetic
     assert film.skeleton_of_plan(plan) is None  # of nothing that is at hand
-    assert film.skeleton_of_plan(replace(shown, policy=POLICY)) is None
+    assert film.skeleton_of_plan(replace(shown, policy=POLICY)) is not None
 
 
 def _silent(stage: str, share: float, note: str) -> None:

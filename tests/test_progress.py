@@ -11,8 +11,10 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +22,9 @@ from PIL import Image
 from rich.console import Console
 
 from clamber.cli import output, progress
-from clamber.cli.commands import EXECUTION, PLANNING
 from clamber.cli.output import INTERRUPTED
-from clamber.cli.tools import DRAWING
+from clamber.show.page import Work
+from clamber.show.track import COSTS, DRAWING, EARLY, EXECUTION, PLANNING, Track
 
 CLIMB = ("detect", *PLANNING, *EXECUTION, *DRAWING)
 
@@ -40,10 +42,10 @@ class Hands:
 def told(pace: dict[str, float], stages: Sequence[str] = CLIMB) -> list[tuple]:
     """(time, share, time left) of a command; `pace`: how much slower stages are."""
     clock = Hands()
-    track = progress.Track(*stages, clock=clock)
+    track = Track(*stages, clock=clock)
     out = []
     for stage in stages:
-        seconds = progress.COSTS[stage] * pace.get(stage, 1.0)
+        seconds = COSTS[stage] * pace.get(stage, 1.0)
         for k in range(11):
             clock.now += seconds / 10 if k else 0.0
             track.update(stage, k / 10)
@@ -59,7 +61,7 @@ def test_where_stages_cost_what_is_known_a_share_of_the_time_is_that_of_the_bar(
     end = seen[-1][0]
     for now, share, left in seen:
         assert share == pytest.approx(now / end, abs=0.06)
-        assert (left is None) == (share < progress.EARLY)
+        assert (left is None) == (share < EARLY)
         if left is not None:
             assert left == pytest.approx(end - now, abs=0.12 * end)
 
@@ -77,7 +79,7 @@ def test_the_share_never_falls_and_the_time_left_never_rises(stage: str, factor:
 
 
 def test_what_is_tried_again_goes_on_from_where_it_was():
-    track = progress.Track("plan", "save", clock=Hands())
+    track = Track("plan", "save", clock=Hands())
     shares = []
     for stage, done in (
         ("plan", 0.0), ("plan", 0.8), ("plan", 0.0), ("plan", 0.5), ("search", 0.1),
@@ -91,9 +93,32 @@ def test_what_is_tried_again_goes_on_from_where_it_was():
     assert shares[-2] < shares[-1] == 1.0
 
 
+def test_what_falls_back_a_little_goes_on_from_there_without_a_jump():
+    track, shares = Track("simulate", clock=Hands()), []
+    for done in (0.0, 0.4, 0.8, 0.78, 0.79, 0.9, 0.88, 0.94, 1.0):
+        track.update("simulate", done)
+        shares.append(track.share)
+    assert shares == sorted(shares)
+    assert shares[3] == shares[2] == pytest.approx(0.8)
+    assert shares[4] == pytest.approx(0.8 + 0.2 * 0.01 / 0.22)
+    assert max(np.diff(shares)) < 0.41
+    assert shares[-1] == pytest.approx(1.0)
+
+
+def test_a_time_left_that_was_far_too_short_is_said_no_more():
+    clock = Hands()
+    track = Track("simulate", clock=clock)
+    said = []
+    for now, done in ((1.0, 0.2), (10.0, 0.25), (20.0, 0.3), (21.0, 0.9), (22.0, 1.0)):
+        clock.now = now
+        track.update("simulate", done)
+        said.append(str(track))
+    assert said == ["0:04 left", "", "", "0:02 left", ""]
+
+
 def shown_on_a_log(reports: Sequence[tuple[str, float]], *stages: str) -> list[str]:
     log = io.StringIO()
-    track = progress.Track(*stages, clock=itertools.count(0.0, 0.1).__next__)
+    track = Track(*stages, clock=itertools.count(0.0, 0.1).__next__)
     with progress.lines(Console(file=log, width=80), track) as report:
         for stage, done in reports:
             report(stage, done, "a note")
@@ -131,7 +156,7 @@ def test_a_log_says_again_what_takes_long(monkeypatch):
 def test_a_terminal_shows_stage_share_and_time_left():
     screen = io.StringIO()
     console = Console(file=screen, width=100, force_terminal=True)
-    track = progress.Track("plan", "save", clock=itertools.count().__next__)
+    track = Track("plan", "save", clock=itertools.count().__next__)
     with progress.bar(console, track) as report:
         report("plan", 0.2, "[LHand]")
         report("plan", 0.5, "RHand")
@@ -143,13 +168,60 @@ def test_a_terminal_shows_stage_share_and_time_left():
 def test_a_bar_that_goes_on_later_is_not_said_to_be_done():
     log = io.StringIO()
     console = Console(file=log, width=80)
-    track = progress.Track("plan", "pictures", clock=Hands())
+    track = Track("plan", "pictures", clock=Hands())
     with progress.lines(console, track, more=True) as report:
         report("plan", 1.0, "")
     assert "100 %" not in log.getvalue()
     with progress.lines(console, track) as report:
         report("pictures", 0.5, "")
     assert log.getvalue().splitlines()[-1] == "100 % done"
+
+
+class Panel:
+    """What `Work` asks of a page's panel."""
+
+    def __init__(self) -> None:
+        self.shares: list[float] = []
+        self.texts: list[str] = []
+
+    def add_progress_bar(self, value: float, visible: bool) -> Any:
+        return _Told(self.shares, value=value, visible=visible)
+
+    def add_html(self, content: str) -> Any:
+        return _Told(self.texts, content=content)
+
+
+class _Told:
+    def __init__(self, told: list[Any], **fields: Any) -> None:
+        vars(self).update(fields, told=told)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        vars(self)[name] = value
+        if name != "visible":
+            self.told.append(value)
+
+
+def test_the_bar_of_a_page_is_of_all_stages_and_never_falls():
+    panel, stages = Panel(), ("detect", *PLANNING, *EXECUTION)
+    work = Work(panel)
+
+    def job() -> str:
+        for stage in stages:
+            for k in range(5):
+                work.report(stage, k / 4, "a note")
+        return "made"
+
+    assert work.do(job, *stages) == "made"
+    shares = panel.shares
+    assert shares == sorted(shares)
+    assert shares[0] == 0.0
+    assert shares[-1] == pytest.approx(100.0)
+    whole = sum(COSTS[s] for s in stages)
+    detected = 100 * COSTS["detect"] / whole
+    assert any(x == pytest.approx(detected) for x in shares)
+    assert max(np.diff(shares)) <= 100 * COSTS["simulate"] / whole / 4 + 1e-9
+    assert any("simulate: a note" in x and "left)" in x for x in panel.texts)
+    assert "made" in panel.texts[-1]
 
 
 # A whole climb.
@@ -215,6 +287,40 @@ def test_ctrl_c_leaves_whole_files_and_says_which(stage: str, tmp_path: Path):
         assert path.name in last
     assert "sequence.json" in last
     assert ("rollout.npz" in last) == (stage in ("pictures", "video"))
+
+
+PRESSED = """
+import importlib.abc, os, signal, sys
+
+class Pressed(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == module:
+            os.kill(os.getpid(), signal.SIGINT)
+
+module, *sys.argv = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Pressed())
+from clamber.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("module", ["tyro", "clamber.cli.flags", "mujoco"])
+def test_ctrl_c_while_it_is_loaded_is_one_sentence(module: str):
+    job = subprocess.run(
+        [sys.executable, "-c", PRESSED, module, "clamber", "climb"],
+        capture_output=True,
+        text=True,
+    )
+    assert job.returncode == INTERRUPTED, job.stderr
+    assert job.stderr.startswith("clamber: interrupted")
+    assert len(job.stderr.splitlines()) == 1, job.stderr
+
+
+def test_that_is_the_program_which_is_installed():
+    project = Path(__file__).parents[1] / "pyproject.toml"
+    scripts = tomllib.loads(project.read_text())["project"]["scripts"]
+    assert scripts == {"clamber": "clamber.__main__:main"}
 
 
 def test_an_interrupt_names_what_a_folder_holds(tmp_path: Path):

@@ -29,7 +29,9 @@ from clamber.execution.verdict import (
     TILT_TOL,
     UNINTENDED_TOL,
     YAW_TOL,
+    Criterion,
     Figure,
+    Verdict,
     judge,
     measure,
     self_penetration,
@@ -198,6 +200,13 @@ def test_progress_goes_from_nothing_to_all(start_only):
     assert seen[0] == 0.0
     assert seen[-1] == 1.0
     assert seen == sorted(seen)
+
+
+def test_progress_is_the_share_of_the_motion_that_is_done(one_hand_plan):
+    seen = []
+    simulate(one_hand_plan, progress=lambda _, share, note: seen.append((share, note)))
+    even = np.linspace(0.0, 1.0, len(seen))
+    assert np.abs(np.array([s for s, _ in seen]) - even).max() < 0.1
 
 
 def test_a_plan_without_a_trajectory_cannot_be_simulated(demo_plan):
@@ -479,6 +488,47 @@ def test_a_box_that_is_not_there_is_no_crash_of_the_judge(start_only):
     nothing = Scene(start=np.zeros(3))
     rollout = simulate(start_only, controller="pid", true_scene=nothing)
     assert not judge(start_only, rollout).reached
+
+
+def test_a_verdict_is_shown_in_percent_millimetres_and_degrees() -> None:
+    heavy = Figure.UNINTENDED
+    figures = {
+        Figure.UPRIGHT: (1.0, 1.0, "did not fall", "yes", "yes"),
+        Figure.WENT_ON: (0.0, 1.0, "did not stop on the way", "no", "yes"),
+        heavy: (0.0123, 0.01, "load on non-contact links", "1.2 %", "at most 1.0 %"),
+        Figure.PENETRATION: (
+            0.00026, 0.01,
+            "deepest penetration of the scene", "0.3 mm", "at most 10.0 mm",
+        ),
+        Figure.END_SPEED: (
+            0.002, 0.05, "pelvis speed at the end", "2.0 mm/s", "at most 50.0 mm/s"
+        ),
+        Figure.TILT: (
+            np.pi / 36, np.pi / 9,
+            "pelvis tilt error at the end", "5.0 deg", "at most 20.0 deg",
+        ),
+    }  # fmt: skip
+    criteria = {
+        f: Criterion(value=row[0], limit=row[1], ok=f is not heavy)
+        for f, row in figures.items()
+    }
+    verdict = Verdict(reached=False, criteria=criteria)
+    shown = [row[2:] for row in figures.values()]
+    assert [row[:3] for row in verdict.rows()] == shown
+    assert [row[3] for row in verdict.rows()] == [c.ok for c in criteria.values()]
+    assert verdict.failed() == "load on non-contact links"
+    for figure in Figure:  # none has a unit that nobody knows
+        assert figure.in_words(0.0)
+        assert "[" not in figure.label
+
+
+def test_a_limit_is_said_to_be_the_least_or_the_most_as_it_is_judged(
+    demo_plan, demo_rollout
+):
+    for figure, c in judge(demo_plan, demo_rollout).criteria.items():
+        if figure.in_words(c.limit) != "yes":
+            least = "at least" in figure.limit_in_words(c.limit)
+            assert (c.value >= c.limit) if least else (c.value <= c.limit), figure
 
 
 def test_who_ends_on_the_feet_alone_must_stand(demo_plan, demo_rollout, figures):

@@ -175,7 +175,7 @@ def test_a_stance_that_is_no_keyframe_is_skipped_and_says_why(world):
     air = ("LFoot RFoot", "LFoot RFoot LHand", "RFoot LHand", "LKnee RFoot LHand")
     hand = ("LFoot RFoot", "LFoot RFoot LHand LElbow", "LFoot RFoot LElbow")
     for stances, reason in (
-        (air, "left leg in the air: part of its next move"),
+        (air, "left leg in the air: part of its next step"),
         (hand, "no limb makes or breaks a load-bearing contact"),
     ):
         (skipped,) = split_steps(sequence(*stances), world)[1]

@@ -88,7 +88,7 @@ def test_contacts_that_come_back_to_where_they_were_end_it():
     to_and_fro = Scripted(lambda key, _: swapped if key is ahead else ahead)
     route = follow([to_and_fro], back, 100).route
     assert (route.arrived, len(route.changes)) == (False, 3)  # and ahead again
-    assert "to and fro" in str(route.failures[0])
+    assert "back and forth" in str(route.failures[0])
     # Other surfaces there are not the same.
     fewer = SimpleNamespace(stance=back.stance[:1])
     none = Scripted(lambda key, k: (ahead, fewer, None)[k - 1])

@@ -3,9 +3,9 @@
 python docs/tools/front.py RUNS docs/front.webp
 
 RUNS holds two run folders, `climb` of a Unitree G1 and `crossing` of COMAN. Beside the
-robot is the built-in demonstration, which is synthetic, as tall as the robot: in the
-climb at the robot's pace, at each contact both are at the same one; the crossing
-follows a policy, and both are played evenly.
+robot is the built-in demonstration, which is synthetic, as tall as the robot and at its
+pace: in the climb they make each contact at the same time, in the crossing they come
+onto the table, along and off it at the same time.
 """
 
 from __future__ import annotations
@@ -40,9 +40,7 @@ def part(folder: Path) -> list[Image.Image]:
     world, end, seconds = rollout.world, float(rollout.time[-1]), SECONDS[folder.name]
     demo = clamber.load_demo(folder.name)
     skeleton = skeleton_of(demo, clamber.detect_contacts(demo))
-    paired = np.array([[0.0, end], demo.t[[0, -1]]])
-    if not plan.iterations:  # it follows the demonstration, not a policy
-        paired = np.array(paired_times(plan, keyframe_times(plan, rollout), end))
+    paired = paired_times(plan, keyframe_times(plan, rollout), end, skeleton)
     seen = seen_points(Kinematics(world), rollout.qpos)
     person = Person(skeleton, world, seen, "corner")
     view = view_of(world, seen, SIZE[0] / SIZE[1], "corner", person.points)

@@ -1,4 +1,4 @@
-"""What can go wrong, as values and as exceptions.
+"""Errors, as status values and as exceptions.
 
 A user's mistake is an `InputError` that names file, field, value and what was
 expected; a file that people write is read by `read_yaml` and checked by `validated`,
@@ -169,7 +169,7 @@ _START = 512  # [byte] by which a file is told
 
 
 def in_its_place(start: bytes, *own: str) -> str | None:
-    """What a file that begins so plainly is and what to do then; not of `own` kinds."""
+    """What a file is by its first bytes, and what to do; not of `own` kinds."""
     plain = start.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
     for short, begins, what, then in _KINDS:
         if short not in own and plain.startswith(begins.lower()):
@@ -178,7 +178,7 @@ def in_its_place(start: bytes, *own: str) -> str | None:
 
 
 def check_kind(path: Path, expected: str, *own: str) -> bytes:
-    """Refuse a file that is plainly something else, by its first bytes.
+    """Refuse a file that is of another kind by its first bytes.
 
     Args:
         path: The file.
@@ -228,7 +228,7 @@ def read_yaml(path: Path) -> dict:
 
 
 def validated(kind: type[T], content: object, source: object) -> T:
-    """What pydantic makes of content read from `source`.
+    """Content read from `source`, validated by pydantic.
 
     Args:
         kind: A pydantic model, a dataclass, or any type that pydantic knows.
@@ -261,7 +261,7 @@ def input_error(error: ValueError, source: object) -> InputError:
     if first["type"] == "missing":
         text, value = "a value: it is missing", None
     elif first["type"] == "extra_forbidden":
-        text = "no such field: mend its name, or leave it out"
+        text = "no such field: correct its name, or leave it out"
     if not where:  # the fields together are wrong: their values are no help
         return InputError(text, source)
     return InputError(text, source, where, value)

@@ -50,9 +50,7 @@ from clamber.cli.output import (
     replanned_record,
     skipped_tables,
 )
-from clamber.cli.progress import Track
 from clamber.cli.tools import (
-    DRAWING,
     ExportCommand,
     RenderCommand,
     ReportCommand,
@@ -63,6 +61,7 @@ from clamber.cli.tools import (
 )
 from clamber.errors import ClamberError, InputError
 from clamber.model.progress import Progress
+from clamber.show.track import DRAWING, EXECUTION, PLANNING, Track
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +76,7 @@ class ClimbCommand:
     contacts: Literal["any", "demonstrated"] = "any"
     """any: other contacts where the demonstrated ones have no stable plan."""
     search: SearchFlags = field(default_factory=SearchFlags)
-    """How far to look for contacts that nobody demonstrated."""
+    """How far to look for contacts beyond the demonstrated ones."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: Switch = False
     """Draw pictures and a video."""
@@ -188,7 +187,7 @@ class PlanCommand:
                 clamber.save_sequence(sequence, folder / "sequence.json")
                 plan = _plan(sequence, robot, scene, self.planning, folder, report)
         record = {"out": str(folder), **plan_record(plan, clock)}
-        note = closing(outcome(plan), folder, plan.complete)
+        note = closing(outcome(plan), folder, plan.complete, plan)
         self.output.show(
             record, *keyframe_tables(record), *skipped_tables(plan), note=note
         )
@@ -216,7 +215,7 @@ class ReplanCommand:
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     search: SearchFlags = field(default_factory=SearchFlags)
-    """How far to look for contacts that nobody demonstrated."""
+    """How far to look for contacts beyond the demonstrated ones."""
     out: Place = None
     """The run folder (runs/replan, then runs/replan-2 ...)."""
     output: Printed
@@ -301,7 +300,7 @@ class ReplanCommand:
             record,
             *tables,
             *skipped_tables(plan),
-            note=closing(note, folder, plan.complete),
+            note=closing(note, folder, plan.complete, plan),
         )
         return REACHED if plan.complete else MISSED
 
@@ -470,9 +469,6 @@ COMMANDS = {
 }
 
 
-PLANNING, EXECUTION = ("plan", "trajectory", "save"), ("simulate", "save run")
-
-
 def _plan(
     sequence: clamber.ContactSequence,
     robot: clamber.Robot,
@@ -482,7 +478,7 @@ def _plan(
     report: Progress,
     others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
-    """Plan and save; `others`: how others are looked for where the shown ones fail."""
+    """Plan and save; `others`: how alternative contacts are searched for."""
     result = clamber.plan(
         sequence,
         robot,
@@ -505,15 +501,18 @@ def _draw(
     track: Track,
     **options: Any,
 ) -> None:
-    """Pictures and video, after the verdict."""
-    missing = ()
+    """Pictures and video, after the verdict has been shown."""
+    missing, files = (), []
     with output.progress(track) as show, filling(folder):
         report = clock.watching(show)
         try:
-            clamber.render_run(folder, report=report, **options)
-        except ClamberError as e:  # it has made it all the same
+            files = clamber.render_run(folder, report=report, **options)
+        except ClamberError as e:  # the climb is as it is all the same
             missing = (str(e),)
     output.warn(*missing)
+    if files:
+        page = f"`clamber report {folder}` makes a page of it"
+        output.tell(f"{files[-1]} shows it; {page}")
 
 
 def _save_timings(folder: Path, clock: Clock) -> None:

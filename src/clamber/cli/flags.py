@@ -89,7 +89,7 @@ RunFolder = Annotated[Path, tyro.conf.Positional, shown("RUN")]
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFlags:
-    """What a recording does not say of itself."""
+    """What a recording file does not say: units, axes, names, scene."""
 
     fit_floor: Switch = False
     """Correct the heights of floor and boxes by whatever rests on them."""
@@ -177,7 +177,7 @@ class PlanningFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchFlags:
-    """How far to look for contacts that nobody demonstrated."""
+    """How far to look for contacts beyond the demonstrated ones."""
 
     tries: int = default_of("planning.records", "Budget", "tries")
     """Steps that are planned at most; 0: no search."""

@@ -21,9 +21,10 @@ from rich.console import Console
 from rich.table import Table
 
 import clamber
-from clamber.cli.progress import Track, bar, lines
+from clamber.cli.progress import bar, lines
 from clamber.execution.events import event_fields
 from clamber.model.progress import Progress
+from clamber.show.track import Track
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
 """The exit codes: success (or the command did its work), failure, bad
@@ -61,6 +62,11 @@ class Output:
         """Say what could not be done, a sentence a line, on stderr."""
         for text in texts if not self.quiet else ():
             sys.stderr.write(f"clamber: {text}\n")
+
+    def tell(self, text: str) -> None:
+        """Say what else there is, to people alone, on stderr."""
+        if not (self.json or self.quiet):
+            sys.stderr.write(f"{text}\n")
 
     def show(self, record: Mapping[str, Any], *tables: Table, note: str = "") -> None:
         """Print one JSON object, or tables and a closing sentence, on stdout."""
@@ -109,7 +115,7 @@ def filling(folder: Path) -> Iterator[None]:
 
 
 class Clock:
-    """Seconds by stage and by move, from what the stages report of themselves."""
+    """Seconds by stage and by contact change, from what the stages report."""
 
     def __init__(self) -> None:
         """Nothing has run yet."""
@@ -128,7 +134,7 @@ class Clock:
                 spent = now - began[last]
                 self._stages[last[0]] = self._stages.get(last[0], 0.0) + spent
                 if last[0] == "plan":
-                    # A move that is tried again, for a later one's sake or with
+                    # One that is tried again, for a later one's sake or with
                     # other weights, costs all of that.
                     move = last[2].rpartition(": ")[2]
                     self._moves[move] = self._moves.get(move, 0.0) + spent
@@ -143,7 +149,7 @@ class Clock:
         return dict(self._stages)
 
     def of(self, move: object) -> float | None:
-        """Seconds that a move took; None where it was not watched."""
+        """Seconds that a contact change took; None where it was not watched."""
         return self._moves.get(str(move))
 
 
@@ -238,22 +244,26 @@ def replanned_record(found: clamber.Replanned) -> dict[str, Any]:
 def outcome(plan: clamber.Plan) -> str:
     """One clause: planned to the end, or why not."""
     if plan.complete:
-        return _after_fallback(plan, "planned to the last stance")
+        return "planned to the last stance"
     return f"no plan: {plan.fallback or plan.why_not}"
 
 
-def _after_fallback(plan: clamber.Plan, note: str) -> str:
-    return note if plan.fallback is None else f"{plan.fallback}; {note}"
+def closing(
+    note: str, folder: Path, well: bool, plan: clamber.Plan | None = None
+) -> str:
+    """The last line: how it ended, where the files are, and what to look at.
 
-
-def closing(note: str, folder: Path, well: bool) -> str:
-    """The last line: how it ended, where the files are, and what to look at."""
+    Before it, where a plan is complete, what it does in place of what was asked for.
+    """
     look = "" if well else f"; `clamber report {folder}` shows how far it came"
-    return f"{note}; the files are in {folder}{look}"
+    said = f"{note}; the files are in {folder}{look}"
+    if plan is None or not plan.complete or plan.fallback is None:
+        return said
+    return f"note: {plan.fallback}\n{said}"
 
 
 def skipped_tables(plan: clamber.Plan) -> list[Table]:
-    """A table of the stances left out, and of what there is no way for."""
+    """A table of the stances left out, and of the steps that could not be planned."""
     rows = [(str(s.stance), s.reason) for s in plan.skipped]
     for f in plan.failures:
         rows.append(("" if f.step is None else str(f.step.stance), str(f)))
@@ -264,7 +274,7 @@ def skipped_tables(plan: clamber.Plan) -> list[Table]:
 
 
 def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
-    """Options, and how the pelvis is held."""
+    """Options, and the distributions of the pelvis's orientation."""
     options = new_table(
         " ".join(("option", name)).strip(), "region", "cycle", "repeats", "begins in",
         "until",
@@ -314,8 +324,8 @@ def conclude(
     table = new_table("criterion", "value", "limit", "")
     rollout, verdict = (None, None) if done is None else done
     criteria = {} if verdict is None else verdict.criteria
-    for name, c in criteria.items():
-        table.add_row(name, f"{c.value:.4g}", f"{c.limit:.4g}", "ok" if c.ok else "NO")
+    for *row, ok in [] if verdict is None else verdict.rows():
+        table.add_row(*row, "ok" if ok else "NO")
     reached = verdict is not None and verdict.reached
     planned = plan_record(plan, clock)
     record = {
@@ -330,14 +340,14 @@ def conclude(
         **planned,
     }
     if reached:
-        note = _after_fallback(plan, "success: the robot reached the goal stance")
+        note = "success: the robot reached the goal stance"
     elif not plan.complete:
         note = outcome(plan)
     elif rollout is not None and rollout.stopped:
         note = f"failed: stopped during execution: {rollout.stopped}"
     else:
-        wrong = [n for n, c in criteria.items() if not c.ok]
-        note = f"failed: {', '.join(wrong) or 'nothing was planned'}"
+        wrong = "" if verdict is None else verdict.failed()
+        note = f"failed: not met: {wrong}" if wrong else "failed: nothing was planned"
     if rollout is not None and not reached:
         note += _strained(rollout)
     tables = keyframe_tables(planned) if clock is not None else []
@@ -348,7 +358,7 @@ def conclude(
             felt.add_row(f"{e.time:.2f}", str(e))
         tables.append(felt)
     tables += [table] if criteria else []
-    note = closing(note, folder, reached)
+    note = closing(note, folder, reached, plan)
     if reached and not drawn:
         note += f"; `clamber render {folder}` draws it"
     output.show(record, *tables, note=note)

@@ -30,11 +30,9 @@ from clamber.cli.output import (
     filling,
     new_table,
 )
-from clamber.cli.progress import Track
 from clamber.errors import ClamberError, InputError
 from clamber.model.progress import Progress
-
-DRAWING = ("pictures", "video")
+from clamber.show.track import DRAWING, Track
 
 
 @dataclass(frozen=True, kw_only=True)

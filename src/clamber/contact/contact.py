@@ -90,7 +90,7 @@ def region_of(contacts: tuple[Contact, ...]) -> Region:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Stance:
-    """The contacts that hold at once, and how the body was held.
+    """The contacts that hold at once, and the body's posture.
 
     Attributes:
         contacts: No surface twice.
@@ -142,7 +142,7 @@ class ContactInterval:
 
     Attributes:
         part: Of the person, such as `LHand`.
-        is_surface: False of a part that bears load and is no surface: a seat.
+        is_surface: False of a part that is loaded and is no contact surface: a seat.
         t0: When it begins [s].
         t1: When it ends [s].
         contact: Where it is.

@@ -92,7 +92,7 @@ def build_demo_policy(sequence: ContactSequence) -> DemoPolicy:
     last: dict[str, dict[str, Contact]] = {}
 
     def leave(stance: Stance, limbs: set[str]) -> None:
-        """Give up what no longer holds, but for limbs that are about to act."""
+        """Break contacts that no longer hold, but for limbs that are about to act."""
         held = states[-1].contacts
         kept = tuple(
             c for c in held if stance.contact(c.surface) or _limb(c.surface) in limbs
@@ -186,7 +186,7 @@ class _Cycle:
 
 
 def dominant_actions(demo: DemoPolicy) -> list[int]:
-    """Indices of the actions whose surfaces bear their limbs.
+    """Indices of the actions whose surfaces carry their limbs' load.
 
     A hand set down while its elbow bears, or just before its elbow is set down again,
     bears nothing.

@@ -1,4 +1,4 @@
-"""What a demonstration does in general: cycles of contacts, and how the pelvis is held.
+"""What a demonstration does in general: cycles of contacts, and the pelvis's pose.
 
 The demo policy is a table of states and actions [thesis 5.1]. A state is a `Stance`:
 contacts and the pelvis's pose, in a region (`G`, `O`, `M`). An action is the surface
@@ -157,7 +157,7 @@ class PelvisDistribution:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class GeneralPolicy:
-    """Options in the order of the task, and how the pelvis is held meanwhile.
+    """Options in the order of the task, and the pelvis's orientation meanwhile.
 
     Attributes:
         options: In the order in which they follow one another; one may come again.
@@ -184,7 +184,7 @@ class GeneralPolicy:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Check that there are options, that they follow one another, the surfaces."""
+        """Check that there are options, their order, and the surfaces."""
         if not self.options:
             raise ValueError("expected at least one option")
         ends = (*(o.region for o in self.options[1:]), "goal")
@@ -265,7 +265,7 @@ def pelvis_distribution(
     *,
     near: float,
 ) -> PelvisDistribution | None:
-    """How the pelvis is held where it is, in the world (5.5 to 5.8).
+    """The pelvis's orientation in the world, by where it is (5.5 to 5.8).
 
     Over the top and near an edge as well, means are averaged (on the circle), and
     sigma = sqrt(sigma_1^2 + sigma_2^2) / 2, the deviation of the mean of two.

@@ -116,7 +116,7 @@ def split_steps(
 ) -> tuple[list[Step], list[Skipped]]:
     """Split each change of stance into steps of one limb, or say why there is none.
 
-    A limb that only leaves its contact is part of its next move where it has one. Where
+    A limb that only leaves its contact is part of its next step where it has one. Where
     two surfaces of a limb are down at once, the one nearer to the trunk bears the load.
 
     Args:
@@ -144,7 +144,7 @@ def split_steps(
                     continue
                 if _comes_back(sequence, i, limb.surfaces):
                     side = limb.name.replace("_", " ")
-                    reasons.append(f"{side} in the air: part of its next move")
+                    reasons.append(f"{side} in the air: part of its next step")
                     continue
                 makes, breaks = None, (down,)
             else:
@@ -179,7 +179,7 @@ def split_steps(
 
 
 def on_feet(world: World, stance: Sequence[Contact]) -> bool:
-    """Whether a stance is one of feet alone: what ends so is meant to stand."""
+    """Whether a stance is on feet alone: a motion that ends so is meant to stand."""
     limb_of = world.robot.limb_of
     limbs = [(limb_of(c.surface), c.surface) for c in stance]
     return bool(limbs) and all(

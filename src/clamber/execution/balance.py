@@ -84,7 +84,7 @@ class Balance:
         return acted or self._acts
 
     def _hold(self, contacts: Sequence[Contact]) -> None:
-        """These bear from here on."""
+        """These contacts are loaded from here on."""
         world, bodies, local, sole = self._kin.world, [], [], []
         for c in contacts:
             s = world.surface(c.surface, c.edge)

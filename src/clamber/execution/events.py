@@ -82,7 +82,7 @@ class Missing(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lost(Event):
-    """A contact of the stance carries no load: it is probed for again."""
+    """A contact of the stance carries no load: it is re-established by probing."""
 
     says = "{surface}: contact lost (no load), probing to re-establish it"
     surface: str
@@ -90,7 +90,7 @@ class Lost(Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GivenUp(Event):
-    """A lost contact was probed for in vain: the stance goes on without it."""
+    """A lost contact was not re-established: the stance goes on without it."""
 
     says = "{surface}: contact not re-established, continuing on the other contacts"
     surface: str

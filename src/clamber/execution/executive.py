@@ -5,9 +5,9 @@ the contact is taken where it is; one that has not touched at the planned point 
 probed for along the normal until it does, or until `REACH` is used up. Where a contact
 is not where it was planned, the supports are estimated anew from all contacts measured
 so far, the stance is taken as it is, and the remaining contact changes are planned
-again from there while the robot stands still. A contact that carries nothing at the end
-of a change is probed for again. Where nothing is found, the others carry the robot and
-another place is planned for the limb; where there is none, the robot stays in the
+again from there while the robot stands still. A contact that carries no load at the end
+of a change is re-established by probing. Where nothing is found, the others carry the
+robot and another place is planned for the limb; where there is none, it stays in the
 stance it is in and says why.
 
 Beside the plan there are four reactions, the most urgent first: to an unintended
@@ -187,7 +187,7 @@ class Executive:
         next(self._behaviour)
 
     def close(self) -> None:
-        """The run is over: its actions let go of what they hold."""
+        """The run is over: release what its actions hold."""
         self._behaviour.close()
 
     def balance(self) -> None:
@@ -211,10 +211,15 @@ class Executive:
     @property
     def left(self) -> int:
         """Physics steps to the end, as far as is known."""
+        ref = self._ref
         if self.core.ends:
-            return self._ref.track.left
-        assert self._plan.trajectory is not None
-        return len(self._plan.trajectory.time)
+            return ref.track.left
+        ahead = len(ref.trajectory.time) - ref.i
+        if self._at_hand.goes_on:  # farther than this part of it
+            assert self._plan.trajectory is not None
+            whole = len(self._plan.trajectory.time)
+            ahead = max(ahead, whole - len(self.core.commanded))
+        return ahead
 
     @property
     def rests_on(self) -> tuple[str, ...]:
@@ -401,7 +406,7 @@ class Executive:
         yield from self._replan(held, held)
 
     def _recover(self) -> Reaction:
-        """Does a contact of the stance carry nothing? Then it is probed for again."""
+        """Does a contact of the stance carry no load? Then probe to re-establish it."""
         for c in self.stance:
             if not self.estimate.is_lost(c):
                 continue

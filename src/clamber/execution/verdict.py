@@ -1,4 +1,4 @@
-"""Plan, rollout -> verdict: whether physics got the robot where the plan says.
+"""Plan, rollout -> verdict: whether the robot ended where the plan says.
 
 A rollout holds what was measured and nothing else, so that whoever writes one down is
 judged alike: `measure` makes figures of it, `judge` compares them with their limits.
@@ -34,6 +34,12 @@ ABOVE_SUPPORT = 0.05  # [m] pelvis at the end
 PENETRATION_TOL = 0.010  # [m] of the robot into itself or into the scene
 GOAL_TOL = 0.15  # [m] pelvis against a goal in the scene
 YAW_TOL = np.radians(15.0)
+SHOWN = {  # for people: the unit of a figure, and how many of another one it is
+    "": (100.0, "%"),
+    "m": (1000.0, "mm"),
+    "m/s": (1000.0, "mm/s"),
+    "rad": (float(np.degrees(1.0)), "deg"),
+}
 EVERY = 5  # recorded states between two looks for self-penetration
 
 
@@ -57,6 +63,28 @@ class Figure(StrEnum):
     GOAL = "pelvis to the goal [m]"
     YAW = "yaw error at the goal [rad]"
 
+    @property
+    def label(self) -> str:
+        """Without the unit."""
+        return self.value.partition(" [")[0]
+
+    def in_words(self, value: float) -> str:
+        """A value for people: yes or no, percent, millimetres or degrees."""
+        if self in (Figure.UPRIGHT, Figure.WENT_ON, Figure.COMPLETE):
+            return "yes" if value else "no"
+        factor, unit = SHOWN[self.value.partition(" [")[2].removesuffix("]")]
+        return f"{factor * value:.1f} {unit}"
+
+    def limit_in_words(self, limit: float) -> str:
+        """A limit for people, and whether it is the least or the most."""
+        words = self.in_words(limit)
+        return words if words == "yes" else f"at {self._bound} {words}"
+
+    @property
+    def _bound(self) -> str:
+        least = (Figure.LOAD_ON_PLAN, Figure.STANDING, Figure.LOAD_ON_OBSTACLES)
+        return "least" if self in (*least, Figure.ABOVE_SUPPORT) else "most"
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Criterion:
@@ -75,7 +103,7 @@ class Criterion:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Verdict(Shown):
-    """Whether physics got the robot there, and by which figures.
+    """Success or failure in physics, and the figures that it rests on.
 
     Attributes:
         reached: Every criterion is met.
@@ -86,6 +114,17 @@ class Verdict(Shown):
     criteria: dict[Figure, Criterion]
 
     __repr__ = short_repr
+
+    def rows(self) -> list[tuple[str, str, str, bool]]:
+        """For people: each criterion's label, value, limit, and whether it is met."""
+        return [
+            (f.label, f.in_words(c.value), f.limit_in_words(c.limit), c.ok)
+            for f, c in self.criteria.items()
+        ]
+
+    def failed(self) -> str:
+        """Labels of the criteria that are not met, between commas."""
+        return ", ".join(f.label for f, c in self.criteria.items() if not c.ok)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""MJCF or URDF file -> MuJoCo's spec, read with care.
+"""MJCF or URDF file -> MuJoCo's spec, with checks and fallbacks.
 
 What a description names is looked for and only read; nothing is written. A URDF's
 `package://` meshes are found beside the file and in `ROS_PACKAGE_PATH`; those that
@@ -34,7 +34,7 @@ PACKAGES = ("package://", "model://")
 SEARCH_PATH = "ROS_PACKAGE_PATH"
 MAX_BYTES = 50_000_000  # of a file
 MAX_FACES = 200_000  # of a mesh that MuJoCo loads
-DETAIL = 2e-3  # [m] nearer corners of what is seen become one
+DETAIL = 2e-3  # [m] nearer vertices of visual meshes are merged
 STL_HEAD, STL_FACE = 84, 50  # [byte] of an STL that is not text
 # What a shape does not need; the rest of a COLLADA file need not be in order.
 _BESIDE = (
@@ -142,7 +142,7 @@ def _one_line(e: Exception) -> str:
 def _resolve_meshes(
     root: ElementTree.Element, path: Path, lenient: bool, notes: list[str]
 ) -> None:
-    """Put where a mesh is in place of what it is called."""
+    """Resolve mesh URIs to the paths of their files."""
     for link in root.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             mesh = shape.find("geometry/mesh")
@@ -172,7 +172,7 @@ def _resolve_meshes(
 
 
 def _fault(mesh: Path) -> str | None:
-    """Why the file of a mesh cannot be one, if so."""
+    """Why a file cannot be a mesh; None where it may be one."""
     try:
         with mesh.open("rb") as f:
             head = f.read(256)
@@ -184,7 +184,7 @@ def _fault(mesh: Path) -> str | None:
 
 
 def _leave_out_looks(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
-    """Take away textures, and what is only seen where its file is not there."""
+    """Remove textures, and visual geometry whose file is missing."""
     for material in spec.materials:
         material.textures = [""] * len(material.textures)
     for texture in spec.textures:
@@ -202,7 +202,7 @@ def _leave_out_looks(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
         for g in shapes:
             spec.delete(g)
         spec.delete(mesh)
-        who = f"what is seen of {links}" if links else f"mesh {mesh.name!r}"
+        who = f"visual geometry of {links}" if links else f"mesh {mesh.name!r}"
         notes.append(f"{who} is left out: {mesh.file} {fault}")
 
 
@@ -214,7 +214,7 @@ def _mesh_path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path) -> Path | 
 
 
 def _leave_out_sizeless(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Take away balls, capsules and boxes whose size is 0: marks, no shapes."""
+    """Remove balls, capsules and boxes whose size is 0: markers, no shapes."""
     kinds = mujoco.mjtGeom
     needed = {kinds.mjGEOM_BOX: 3, kinds.mjGEOM_ELLIPSOID: 3}
     solid = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER, *needed)
@@ -232,7 +232,7 @@ def _take_meshes(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
     upright = _fits_upright(spec, found)
     if upright:
         notes.append(
-            "the up axis of its COLLADA meshes is heeded: ignored, as RViz does, they"
+            "the up axis of its COLLADA meshes is applied: ignored, as RViz does, they"
             " do not reach their joints"
         )
     for mesh in spec.meshes:
@@ -269,11 +269,11 @@ def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> np.ndarray:
 
 
 def _fits_upright(spec: mujoco.MjSpec, meshes: Mapping[str, MeshFile]) -> bool:
-    """Whether a description expects that the up axis of COLLADA files is heeded.
+    """Whether a description expects the up axis of COLLADA files to be applied.
 
-    RViz and Gazebo ignore it, Bullet heeds it, and people write for what they use. The
-    joints of a link tell: they are within its meshes or near them. Sums up how far
-    each is from the box around each mesh, with the axis ignored and heeded.
+    RViz and Gazebo ignore it, Bullet applies it, and people write for what they use.
+    The joints of a link tell: they are within its meshes or near them. Sums up how far
+    each is from the box around each mesh, with the axis ignored and applied.
     """
     off = np.zeros(2)
     for geom in spec.geoms:
@@ -293,7 +293,7 @@ def _fits_upright(spec: mujoco.MjSpec, meshes: Mapping[str, MeshFile]) -> bool:
 def _check_inertia(
     root: ElementTree.Element, path: Path, lenient: bool, notes: list[str]
 ) -> None:
-    """What has mass must have a positive inertia."""
+    """Check that links with mass have a positive inertia."""
     for link in root.findall("link"):
         inertial = link.find("inertial")
         if inertial is None:
@@ -321,7 +321,7 @@ def _check_inertia(
 
 
 def _keep_all(root: ElementTree.Element) -> None:
-    """Ask MuJoCo to keep what it would drop: the root's mass, what is only seen."""
+    """Ask MuJoCo to keep what it would drop: the root's mass, visual geometry."""
     extension = root.find("mujoco")
     if extension is None:
         extension = ElementTree.SubElement(root, "mujoco")
@@ -479,7 +479,7 @@ def _tag(element: ElementTree.Element) -> str:
 
 
 def _written_out(root: ElementTree.Element, scene: ElementTree.Element) -> int:
-    """How long a scene is where all that it names stands in place of the name.
+    """Length of a scene with all of its references expanded.
 
     Nodes that name one another can multiply without end.
     """

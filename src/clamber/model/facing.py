@@ -30,7 +30,7 @@ SOLE_DEPTH = 0.04  # share of the shank: points this near to the lowest are the 
 
 
 def side_told(left: str, right: str) -> int:
-    """1 where a pair of names differs as left and right do, -1 as right and left."""
+    """1 where a pair of names says left and right, -1 where right and left."""
     a, b = left.lower(), right.lower()
     for x, y in SIDES:
         for sign, p, q in ((1, a, b), (-1, b, a)):
@@ -41,7 +41,7 @@ def side_told(left: str, right: str) -> int:
 
 
 def sides_told(pairs: Iterable[tuple[str, str]]) -> float:
-    """From -1 (all pairs of names swapped) over 0 (they say nothing) to 1."""
+    """From -1 (all pairs of names swapped) over 0 (no evidence) to 1."""
     told = [s for s in (side_told(a, b) for a, b in pairs) if s]
     return float(np.mean(told)) if told else 0.0
 
@@ -49,7 +49,7 @@ def sides_told(pairs: Iterable[tuple[str, str]]) -> float:
 def signs_of_ahead(
     tree: Tree, limbs: Mapping[str, Sequence[Chain]], forward: np.ndarray
 ) -> dict[str, float]:
-    """What tells where ahead is: positive for `forward`, by how much it counts.
+    """Evidence for which way is forward: positive for `forward`, with weights.
 
     Args:
         tree: The description.
@@ -86,7 +86,7 @@ def signs_of_ahead(
 
 
 def said_of_ahead(signs: Mapping[str, float]) -> list[str]:
-    """Notes where the signs of ahead, positive for what was taken, disagree."""
+    """Notes where that evidence, positive for what was taken, disagrees."""
     against = [n for n, x in signs.items() if x < 0]
     lost, all_told = -sum(signs[n] for n in against), sum(map(abs, signs.values()))
     notes = []
@@ -169,14 +169,14 @@ def _room(tree: Tree, chain: Chain) -> tuple[float, float]:
 
 
 def _folds(tree: Tree, chain: Chain, forward: np.ndarray) -> float:
-    """1 where a limb can only fold ahead, -1 only back, 0 both ways or aside."""
+    """1 where a limb can only flex forward, -1 only back, 0 both ways or sideways."""
     low, high = _room(tree, chain)
     along = float(_motion(tree, chain) @ forward)
     return along * (high - low) / max(high + low, 1e-9)
 
 
 def _looks(tree: Tree, shoulders: Sequence[np.ndarray], forward: np.ndarray) -> float:
-    """1 where what sees looks ahead, or is ahead of the shoulders; -1 behind them."""
+    """1 where cameras look ahead, or are ahead of the shoulders; -1 behind them."""
     model, data = tree.model, tree.data
     looks = [
         float(-data.cam_xmat[c].reshape(3, 3)[:, 2] @ forward)

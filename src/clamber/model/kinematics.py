@@ -129,7 +129,7 @@ class Kinematics:
     def bearing_points(
         self, surface: str, normal: np.ndarray, edge: int | None = None
     ) -> np.ndarray:
-        """(K, 3) the points that bear force on a support with that normal."""
+        """(K, 3) the points that carry force on a support with that normal."""
         s = self.world.surface(surface, edge)
         p = self.point(s.body, s.corners)
         return p - s.radius * normal if s.radius else p

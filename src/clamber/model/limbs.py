@@ -224,7 +224,7 @@ def _without_toes(tree: Tree, way: list[int], knee: int) -> list[int]:
 
 
 def _bending(tree: Tree, joints: list[int], end: int) -> tuple[int, float]:
-    """Which hinge is the knee or elbow, and which way it shortens the limb.
+    """Which hinge is the knee or elbow, and the direction in which it flexes.
 
     That with the largest product of levers: distance of its axis from the limb's second
     joint, the middle of shoulder or hip, times that from its tip. A twist has none on

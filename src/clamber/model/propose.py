@@ -73,7 +73,7 @@ REFERENCE_MOMENT = 28.9 * 0.512  # [kg m] mass times height of its centre of mas
 REFERENCE_INERTIA = 28.9 * 0.512**2  # [kg m^2]
 REFERENCE_KP, REFERENCE_KD, REFERENCE_KI = 600.0, 20.0, 9.0
 ARMATURE, DAMPING = 0.05, 3.0  # of a joint whose description has none
-WEAK = 0.05  # share of weight times height: weaker joints have a light drive
+WEAK = 0.05  # share of weight times height: weaker joints have low gains
 WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
 MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
 COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
@@ -89,7 +89,7 @@ class Proposal:
     Attributes:
         name: Of the robot.
         mjcf: Text of its model of plain shapes.
-        files: Meshes of what is seen, by their names in `MESH_FOLDER` beside the model.
+        files: Visual meshes, by their names in `MESH_FOLDER` beside the model.
         fields: Of `robot.yaml`.
         guessed: Joints whose effort limit is a guess: the description has none.
         notes: What the user should know, a sentence each.
@@ -237,7 +237,7 @@ def _upright(description: Description, path: Path) -> tuple[Tree, Anatomy, list[
 
 
 def _stood_up(tree: Tree, mimics: Mapping[str, str]) -> tuple[Tree, Anatomy, list[str]]:
-    """The description upright: where its z is not up, whichever axis is.
+    """The description with z up, whichever of its axes is up.
 
     Shoulders are over hips and hips over feet. As it is, it stays where it is upright,
     or no other way is clearly better.
@@ -288,7 +288,7 @@ def _turned(tree: Tree, quat: np.ndarray, mimics: Mapping[str, str]) -> Tree:
 def _driven(
     tree: Tree, found: Anatomy, mimics: Mapping[str, str], path: Path
 ) -> list[str]:
-    """A note on joints of limbs that motors beside them drive: gears, rods, belts.
+    """A note on limb joints driven by transmissions: gears, rods, belts.
 
     Raises:
         InputError: One follows another that moves a limb, too.
@@ -307,7 +307,7 @@ def _driven(
 
 
 def _release(spec: mujoco.MjSpec, base: mujoco.MjsBody, path: Path) -> str:
-    """Take away the joints that a base moves on freely; how it was held, in words."""
+    """Remove the joints that a base moves on freely; how it was held, in words."""
     joints = list(base.joints)
     if not joints:
         return "fixed to the world"
@@ -360,7 +360,7 @@ def robot_yaml(proposal: Proposal) -> str:
         *block(
             "gains",
             "[N m/rad], [N m s/rad], [N m/(rad s)]: those of the built-in robot by"
-            " weight times height; weak joints have a light drive.",
+            " weight times height; weak joints have low gains.",
         ),
         *block("impedance", "Joints that mixed control makes compliant."),
         *block(
@@ -409,7 +409,7 @@ def nominal_posture(
 def _over_ankles(
     tree: Tree, data: mujoco.MjData, found: Anatomy, effort: Mapping[str, float]
 ) -> tuple[float, float]:
-    """How far back and ahead ankles hold the centre of mass with half of their effort.
+    """How far the CoM may be behind and ahead of the ankles at half of their effort.
 
     [m] along x; each leg bears half of the weight.
     """
@@ -574,7 +574,7 @@ def effort_of(model: mujoco.MjModel, joint: int) -> float | None:
 def _hand_load(
     tree: Tree, found: Anatomy, shapes: Sequence[Shape], effort: Mapping[str, float]
 ) -> float:
-    """What each hand bears whichever way it is turned about its wrists [N]."""
+    """Force that each hand carries in every orientation of its wrist [N]."""
     data, balls = tree.data, {s.name: s for s in shapes if s.surface}
     out = np.inf
     for side, chain in zip("LR", found.pair("arm"), strict=True):

@@ -1,4 +1,4 @@
-"""robot.yaml -> Robot: what a planner must know beyond an MJCF or URDF.
+"""robot.yaml -> Robot: what planning needs beyond an MJCF or URDF.
 
 Which geoms are surfaces, which chain is a limb, where it stands at the start.
 """
@@ -127,7 +127,7 @@ class Robot:
         return tuple(s for limb in self.limbs.values() for s in limb.surfaces)
 
     def limb_of(self, surface: str) -> Limb:
-        """The limb that bears a surface."""
+        """The limb that a surface belongs to."""
         for limb in self.limbs.values():
             if surface in limb.surfaces:
                 return limb
@@ -250,7 +250,7 @@ def _check(robot: Robot, source: Path) -> None:
             prefix = robot.prefixes[s]
             if not any(has_prefix(g, prefix) for g in geoms):
                 expected = (
-                    f"a surface that geoms of {file} bear by the prefix {prefix!r}"
+                    f"a surface: geoms of {file} whose names begin with {prefix!r}"
                 )
                 raise InputError(expected, source, f"{where}.surfaces", s)
 
@@ -287,7 +287,7 @@ def _check_joints(
 
 
 def has_prefix(geom: str, prefix: str) -> bool:
-    """Whether a geom bears a name, alone or with a suffix."""
+    """Whether a geom has a name, alone or with a suffix."""
     return geom == prefix or geom.startswith(prefix + "_")
 
 

@@ -111,8 +111,8 @@ def link_shapes(tree: Tree) -> tuple[list[Shape], list[str]]:
             notes.append(f"{body} has no geometry: a box of its inertia is taken")
     if thin:
         notes.append(
-            "no collision geometry, or too little for its mass, so that what is seen is"
-            f" taken: {', '.join(thin)}"
+            "no collision geometry, or too little for its mass: visual geometry is "
+            f"taken for {', '.join(thin)}"
         )
     return shapes, notes
 
@@ -237,7 +237,7 @@ def _points_of(shapes: Sequence[Shape], links: set[int]) -> np.ndarray:
 
 
 def _ball(name: str, link: int, centre: np.ndarray, radius: float) -> Shape:
-    """Standing out a little."""
+    """A ball that protrudes a little."""
     return Shape(
         name=name, link=link, kind=_SPHERE, size=(radius + PAD,), position=centre
     )
@@ -366,7 +366,7 @@ def _largest_rectangle(
 def with_room(
     tree: Tree, found: Anatomy, shapes: Sequence[Shape], home: Mapping[str, float]
 ) -> tuple[list[Shape], list[tuple[str, str]], list[str]]:
-    """Shapes with `ROOM` around them in the nominal posture.
+    """Shapes with `ROOM` as clearance in the nominal posture.
 
     Links that pass each other by less are built to; whoever plans keeps that room. What
     is no surface gives way, by `THINNER` of its size at most, and so do the balls of
@@ -446,7 +446,7 @@ def build_spec(
         shapes: Of its links.
         apart: Names of links that may overlap.
         drives: Armature and damping by joint.
-        looks: Whether what is seen is part of it.
+        looks: Whether visual geometry is part of it.
 
     Returns:
         The spec, and the files of its meshes by name, in `MESH_FOLDER`.
@@ -551,7 +551,7 @@ def _add_looks(
     links: np.ndarray,
     files: dict[str, bytes],
 ) -> bool:
-    """Add what is seen of a link, else its collision meshes; is there any?"""
+    """Add the visual geometry of a link, else its collision meshes; is there any?"""
     model, data = tree.model, tree.data
     meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)

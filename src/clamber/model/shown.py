@@ -1,4 +1,4 @@
-"""Records that notebooks and browsers show, though how is known on a floor above.
+"""Records that notebooks and browsers display; `show` registers how.
 
 The package says who shows them (`shown_by`) before any record is made.
 """

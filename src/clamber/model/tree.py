@@ -1,4 +1,4 @@
-"""The tree of a description at its zero posture: links, what hangs on what, points.
+"""The kinematic tree of a description at zero: links, children, points.
 
 Links are groups of bodies that are fixed to one another; a link is named after its
 first body.
@@ -51,7 +51,7 @@ class Chain:
 
 
 class Tree:
-    """A description at its zero posture, and what hangs on what in it.
+    """A description at its zero posture, and its parent-child relations.
 
     Attributes:
         model: With one floating body.
@@ -122,21 +122,21 @@ class Tree:
         return list(range(first, first + int(self.model.body_jntnum[body])))
 
     def hangs_on(self, body: int, ancestor: int) -> bool:
-        """Whether a body is another, or hangs on it."""
+        """Whether a body is another, or a descendant of it."""
         while body and body != ancestor:
             body = int(self.model.body_parentid[body])
         return body == ancestor
 
     def below(self, body: int) -> list[int]:
-        """A body and all that hang on it."""
+        """A body and its descendants."""
         return [b for b in range(1, self.model.nbody) if self.hangs_on(b, body)]
 
     def count(self, body: int) -> int:
-        """Joints of a body and of all that hang on it."""
+        """Number of joints of a body and of its descendants."""
         return int(self.model.body_jntnum[self.below(body)].sum())
 
     def children(self, link: int) -> list[int]:
-        """Bodies with joints that hang on a link."""
+        """Child bodies of a link that have joints."""
         m = self.model
         return [
             b
@@ -145,7 +145,7 @@ class Tree:
         ]
 
     def way_out(self, body: int) -> list[int]:
-        """Bodies with joints from one on, until the chain ends or becomes fingers."""
+        """Bodies with joints outward from one, to the end of the chain or fingers."""
         way = [body]
         while True:
             children = self.children(way[-1])
@@ -168,7 +168,7 @@ class Tree:
     ) -> np.ndarray:
         """(K, 3) points in the world on the geometry of a link.
 
-        Its collision geometry; what is only seen where it has none.
+        Its collision geometry; visual geometry where it has none.
 
         Args:
             link: Its first body.
@@ -189,7 +189,7 @@ class Tree:
     def far(self, chain: Chain, data: mujoco.MjData | None = None) -> np.ndarray:
         """(3,) middle of a limb's end, away from its knee or elbow.
 
-        Where no shape of it is away from there, the centre of its mass is.
+        Where no shape of it is away from there, its centre of mass is.
         """
         here = self.data if data is None else data
         points = self.points(int(self.links[chain.end]), below=True, data=here)

@@ -1,4 +1,4 @@
-"""Humanoids whose models common wheels carry, by name: where their files are.
+"""Humanoids whose models come with Python wheels, by name: where their files are.
 
 A wheel need not be installed with what it depends on, nor is it imported.
 """

@@ -1,4 +1,4 @@
-"""The steps of a sequence in order: one is mended, or left out at a price.
+"""The steps of a sequence in order: one is repaired, or left out at a cost.
 
 Each step is planned from the keyframe before it. Where a step fails because of where an
 earlier contact lies, that contact is put where the step would have liked it, and
@@ -168,7 +168,7 @@ class _Line:
         return line
 
     def _mend(self, search: Search, failure: Failure) -> _Line:
-        """Back at the first contact that is put elsewhere, or the step left out."""
+        """Back at the first contact that is moved, or the step left out."""
         step, better = self.steps[self.k], None
         if self.mended < MAX_REPAIRS:
             better = next(repairs(search.ik, self.route, step), None)

@@ -1,4 +1,4 @@
-"""Robot or scene -> what a planner sees of it, and what is wrong with it."""
+"""Robot or scene -> key figures for planning, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -279,7 +279,7 @@ def check_start(ik: IK, start: Keyframe) -> None:
             value=" and ".join(names),
         )
     if start.com_margin < 0 or not start.equilibrium.feasible:
-        why = f"its mass is {-1e3 * start.com_margin:.0f} mm beside its soles"
+        why = f"its CoM is {-1e3 * start.com_margin:.0f} mm outside its soles"
         if start.com_margin >= 0:
             why = limiting_joint(ik.kin, start.q, start.stance)
         raise InputError(

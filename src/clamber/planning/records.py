@@ -136,7 +136,7 @@ def summary(attempts: Iterable[Attempt]) -> tuple[Tried, ...]:
 
 
 def told(tried: Sequence[Tried]) -> str:
-    """One clause: what was tried besides the demonstrated contacts, in vain."""
+    """One clause: what else was tried, without success, than was demonstrated."""
     others = [t for t in tried if t.proposer not in ("demonstrated", "search")]
     said = "there is no alternative"
     if others:
@@ -297,4 +297,4 @@ class Plan(Viewed):
         if self.complete:
             return ""
         reasons = (*map(str, self.failures), *(s.reason for s in self.skipped))
-        return next(iter(reasons), "there is no move in it")
+        return next(iter(reasons), "it has no contact change")

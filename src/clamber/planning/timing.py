@@ -1,4 +1,4 @@
-"""Path -> the fastest time law along it that joints and contacts can bear.
+"""Path -> the fastest time law that torque limits and friction cones allow.
 
 With q(s) given, joint torques and contact forces are linear in u = d2s/dt2 and
 x = (ds/dt)^2. What (u, x) some forces within the friction cones and some torques within
@@ -118,7 +118,7 @@ def bearable(
     u_max: float,
     x_max: float,
 ) -> np.ndarray | None:
-    """(K, 2) corners of a polygon of (u, x) that can be borne, rest among them.
+    """(K, 2) vertices of a polygon of feasible (u, x), rest among them.
 
     From inside: each corner is found with its contact forces. None where not even rest
     is within the limits.

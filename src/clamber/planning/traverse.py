@@ -101,7 +101,7 @@ class Follower:
         route, _ = follow_steps(self.search, start, steps, "gait")
         failure = next(iter(route.failures), None)
         if not steps:
-            failure = stuck("nothing is left to climb with")
+            failure = stuck("no steps up the obstacle are left to try")
         if failure is not None:
             return Outcome(key=route.end, failure=failure)
         options = (option for _, option in climb.steps)
@@ -185,7 +185,7 @@ def follow(followers: Sequence[Follower], start: Keyframe, most: int) -> Followe
             failure = stuck(why)
             break
         if any(_is_same(since[-1], stance) for stance in since[:-1]):
-            why = f"it only goes to and fro, {to_go:.2f} m from the goal"
+            why = f"it moves back and forth, {to_go:.2f} m from the goal"
             failure = stuck(why)
             break
         if search.late:

@@ -1,4 +1,4 @@
-"""The two demonstrations that the package brings: synthetic, and they say so.
+"""The two built-in demonstrations, which are synthetic and labelled so.
 
 No recording of such motions is free to ship, so a program made these (`tests/support`
 holds it, and the contacts that are true). A file has the motion without noise, as whole

@@ -321,7 +321,7 @@ def _labels(parameters: _Parameters, count: int, notes: list[str]) -> list[str]:
 def _up(parameters: _Parameters) -> str | None:
     """The axis that the screen shows upward.
 
-    Its sign is not heeded: programs write -Z for a laboratory whose z is up.
+    Its sign is ignored: programs write -Z for a laboratory whose z is up.
     """
     words = _words(parameters, "Y_SCREEN")
     axis = words[0].strip().lower().lstrip("+-") if words else ""

@@ -1,4 +1,4 @@
-"""Which part of the person is loaded on which support, and when.
+"""Contact detection: which part of the person is loaded on which support, when.
 
 A part is in contact while one of its points is near a support, inside its outline and
 slow, with hysteresis in height and speed and a minimum duration. Joint centres lie
@@ -203,7 +203,7 @@ def detect_contacts(
 
 
 def _apart_from_floor(demo: Demonstration) -> str:
-    """Why there may be no contact: how far feet and floor are apart, and which way."""
+    """Why no contact was found: how far, and which way, feet and floor are apart."""
     floor = find_floor(demo)
     if floor is not None:
         return say_floor(floor)

@@ -122,7 +122,7 @@ def settle(demo: Demonstration) -> Demonstration:
 
 
 def say_floor(floor: Level) -> str:
-    """How far feet and floor are apart, which way, and what mends it."""
+    """How far feet and floor are apart, which way, and how to correct it."""
     way = "above" if floor.correction > 0 else "below"
     what = {"Foot": "the feet rest", "Knee": "the knees rest", "Hand": "hands rest"}
     return (
@@ -191,7 +191,7 @@ def _raised(box: Box, lift: float) -> Box:
 def _resting(
     demo: Demonstration, part: str, support: Support, reach: float, ankle: bool = False
 ) -> np.ndarray:
-    """(N,) clearances [m] of a part, sample by sample, at rest."""
+    """(N,) clearances [m] of a part at its samples at rest."""
     point = part if ankle else _telling(demo, part)
     if point is None or point[1:] not in demo.offsets:
         return np.empty(0)
@@ -206,7 +206,7 @@ def _resting(
 
 
 def _telling(demo: Demonstration, part: str) -> str | None:
-    """The point whose height tells: toe, knee or knuckle; a wrist tells nothing."""
+    """The point whose height is evidence: toe, knee or knuckle; no wrist."""
     best = {"Foot": part + ".toe", "Hand": part + ".knuckle"}.get(part[1:], part)
     if best in demo.names:
         return best

@@ -1,4 +1,4 @@
-"""What the names of joints and markers say: one grammar for every tool's words.
+"""Names of joints and markers: one grammar for the conventions of all tools.
 
 A name is a side and a word, in any order and with any separators: `LeftLeg`, `thigh_l`,
 `thigh.L`, `KneeLeft`, `Bip01 L Thigh`, `jLeftKnee`, `l_shank_4X4`, `R.Knee.Lat`. What
@@ -178,7 +178,7 @@ def plain_name(name: str) -> str:
 
 
 def prefixes_of(names: Sequence[str]) -> list[str]:
-    """Beginnings that may say nothing or name a person; none first, then the longest.
+    """Prefixes that may be a namespace or a person; none first, then the longest.
 
     Many names share them, up to a separator; or most of all names begin so.
     """

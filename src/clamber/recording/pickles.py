@@ -1,4 +1,4 @@
-"""Pickles as plain data: arrays, numbers, text, lists, dictionaries, and no programs.
+"""Pickles as plain data: arrays, numbers, text, lists, dictionaries; no code runs.
 
 A pickle names functions to call. Here none of them is: the few that make arrays have
 stand-ins of our own, objects of SciPy's sparse matrices, chumpy and the tools that

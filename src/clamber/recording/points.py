@@ -1,4 +1,4 @@
-"""What a recording's file says before anybody asks who the person is: named points.
+"""Named points of a recording file, before they are mapped to a person.
 
 Every reader ends here. Units and axes are still the file's own; where the file does not
 say which, the field is None and `recording` decides. Tables of numbers in text files,
@@ -69,7 +69,7 @@ class Points:
 
 
 def read_safely(read: Callable[[Path], Points], path: Path) -> Points:
-    """Points of a reader, checked for what no format allows.
+    """Points of a reader, checked for what every format requires.
 
     Raises:
         InputError: The file cannot be opened, or is of no use.
@@ -110,7 +110,7 @@ def unit_of(word: str, where: str, notes: list[str]) -> float | None:
     plain = re.sub(r"[\s\[\]().\"'\0]", "", word.lower())
     plain = plain if plain in METRES else plain + "s"  # millimeter
     if plain != "s" and plain not in METRES:
-        notes.append(f"{where}: {_printed(word)!r} is no unit of length, not heeded")
+        notes.append(f"{where}: {_printed(word)!r} is no unit of length: ignored")
     return METRES.get(plain)
 
 
@@ -268,7 +268,7 @@ def place_rows(
 
 
 def say_count(found: int, said: float, what: str) -> list[str]:
-    """A note on a file whose heading promises another count of rows than it has."""
+    """A note on a file whose header states another number of rows than it has."""
     if found == said:
         return []
     return [f"{what} says {said:g}, the file has {found} rows"]

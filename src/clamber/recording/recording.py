@@ -1,4 +1,4 @@
-"""From any recording's file, with or without a `recording.yaml`, to a Demonstration.
+"""Any recording file, with or without a `recording.yaml` -> Demonstration.
 
 The readers say what is in a file; here it is decided what that means: which format it
 is, what the names are, which unit and which axis, which box is the ground, and what of

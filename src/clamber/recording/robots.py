@@ -1,4 +1,4 @@
-"""A robot's motion as a recording: what retargeting and trackers write, as points.
+"""A robot's motion as a recording: output of retargeting or trackers, as points.
 
 Root and joints over time, by the words of several tools, become the robot's own points
 by its own kinematics: joints at the ends of its limbs' segments, and of hands and feet

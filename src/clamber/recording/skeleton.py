@@ -1,4 +1,4 @@
-"""Marker sets and skeletons, told by their names, and the joint centres that they give.
+"""Marker sets and skeletons, recognised by names, and their joint centres.
 
 A *skeleton* has a point at each joint's centre: what is called what is enough. A
 *marker set* lies on the skin: centres are computed from it, by regression where the

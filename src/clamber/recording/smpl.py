@@ -1,4 +1,4 @@
-"""SMPL's bodies: joints from poses and shape, where the body model is at hand.
+"""SMPL bodies: joints from pose and shape parameters and a body model file.
 
 `poses`, `trans` and `betas`, as AMASS has them, say how a body is bent, not where its
 joints are: those come from the licensed model's mean shape and joint regressor.

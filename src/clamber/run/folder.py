@@ -614,7 +614,7 @@ def load_fields(folder: str | Path, name: str) -> dict[str, Any]:
 
     Args:
         folder: The run folder.
-        name: `plan.json`, `execution.json`, `verdict.json` or `timings.json`.
+        name: `plan.json`, `execution.json` or `timings.json`.
 
     Raises:
         InputError: It is missing or broken.
@@ -625,9 +625,7 @@ def load_fields(folder: str | Path, name: str) -> dict[str, Any]:
     at = _read(folder / name)
     if name == PLAN:
         _plan_of(at)
-    elif name == EXECUTION:
+    else:
         _execution_of(at)
         CODEC.decode(Scene, at.key("scene"))
-    else:
-        CODEC.decode(Verdict, at)
     return at.value

@@ -1,4 +1,4 @@
-"""The way from the posture that was measured on a robot to the first one of its plan.
+"""Motion from the posture measured on a robot to the first posture of its plan.
 
 A straight line in joint angles, along it a minimum-jerk profile,
 
@@ -148,7 +148,7 @@ def _between(
 def _check(
     world: World, measured: np.ndarray, first: np.ndarray, stance: tuple[Contact, ...]
 ) -> None:
-    """Refuse a way on which links meet each other or the scene.
+    """Refuse a motion in which links collide with each other or the scene.
 
     A surface against the support that it stands on is not looked at: where the legs
     are bent more or less than in the first posture, the base gives way, which is held

@@ -1,4 +1,4 @@
-"""Where a robot is: from a file that a person writes, or from what physics did."""
+"""The state of a robot: from a state file, or from a rollout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Series of a run over time in the panel of its page, with values under the pointer."""
+"""Time plots in the panel of a run's page, with values under the pointer."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from clamber.show.sample import Motion, peaks, row_at
 
 MOST = 500  # samples: as many as the panel is wide [px]
 HEIGHT = 200  # [px]
+MARGIN = 0.05  # above and below the series
 FEW = 5  # joints that are named
 COLOURS = ("#2563eb", "#c2410c", "#0891b2", "#d97706", "#7c3aed", "#db2777", "#15803d")
 NOW = "#dc2626"
@@ -24,17 +25,20 @@ def series_of(m: Motion) -> dict[str, _Series]:
     margin = {"measured" if m.loads is not None else "planned": m.margin}
     if m.planned_margin is not None:
         margin["planned"] = m.planned_margin
-    found["centre of mass inside [m]"] = margin
+    found["CoM margin [m]"] = margin
     names = m.world.surfaces
     if m.size is not None:
         found["contact forces [N]"] = dict(zip(names, m.size.T, strict=True))
     if m.effort is not None:
         most = np.argsort(-np.abs(m.effort).max(axis=0))[:FEW]
-        joints = {list(m.world.joints)[i]: m.effort[:, i] for i in most}
-        found["joint torque, share of limit"] = joints
+        joints = {list(m.world.joints)[i]: 100 * m.effort[:, i] for i in most}
+        found["joint torque [% of its limit]"] = joints
     if m.error is not None:
-        found["joint error [rad]"] = {"largest": m.error[:, 0], "rms": m.error[:, 1]}
-        found["base off the plan [m]"] = {"distance": m.error[:, 2]}
+        found["joint tracking error [rad]"] = {
+            "largest": m.error[:, 0],
+            "rms": m.error[:, 1],
+        }
+        found["base position error [m]"] = {"distance": m.error[:, 2]}
     heights = dict(zip(names, m.points[:, :, 2].T, strict=True))
     found["heights of surfaces [m]"] = heights
     return found
@@ -72,7 +76,7 @@ class Chart:
             self._plot.data = (*self._data, self._mark(t))
 
     def _chosen(self) -> None:
-        """Another one, where that is not the page's own doing."""
+        """Another plot was chosen by the user."""
         with self._page.clock.lock:
             if str(self._choice.value) != self._title:
                 self._draw()
@@ -91,6 +95,10 @@ class Chart:
             looks.append(
                 {"label": name, "stroke": COLOURS[i % len(COLOURS)], "width": 1.5}
             )
+        # The browser would find no range among the gaps of the mark.
+        finite = lines[np.isfinite(lines)]
+        least, most = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
+        room = MARGIN * (most - least) or 1.0
         points = {"show": True, "size": 8}
         looks.append({"label": "now", "stroke": NOW, "points": points})
         if self._plot is not None:
@@ -99,7 +107,10 @@ class Chart:
             self._plot = self._page.server.gui.add_uplot(
                 (*self._data, self._mark(self._page.clock.t)),
                 tuple(looks),
-                scales={"x": {"time": False}},
+                scales={
+                    "x": {"time": False},
+                    "y": {"range": (least - room, most + room)},
+                },
                 height=HEIGHT,
             )
 

@@ -34,6 +34,7 @@ from clamber.run.folder import (
 )
 from clamber.show.page import Page, Work, paragraphs
 from clamber.show.scene3d import ALIKE, GHOST, GHOST_OPACITY
+from clamber.show.track import EXECUTION, PLANNING
 
 INSET = 0.01  # [m] a contact that is dragged stays so far inside its support
 FOLDER = "edited"  # in the run folder
@@ -81,7 +82,7 @@ class Interval:
 
 
 def intervals_of(plan: Plan) -> dict[str, Interval]:
-    """The contacts of a plan's sequence that can be moved: those made on the way.
+    """The contacts of a plan's sequence that can be moved: those made after the start.
 
     By a name for people, in order.
     """
@@ -178,7 +179,7 @@ def save_edited(
 
 
 class Editor:
-    """Contacts and boxes to move, surfaces to switch off, and what becomes of it."""
+    """Contacts and boxes to move, surfaces to switch off; plan and simulate again."""
 
     def __init__(
         self,
@@ -219,14 +220,14 @@ class Editor:
             "height [m]", 0.3, min=0.01, step=0.005, visible=False
         )
         self._use = {s: gui.add_checkbox(f"use {s}", True) for s in surfaces}
-        self._buttons = {
-            "Re-plan": self._plan_again,
-            "Simulate": self._run_physics,
-            "Save": self._save,
-            "Undo": self._undo,
-            "Undo all": self._forget,
+        buttons: dict[str, tuple[Callable[[], str], *tuple[str, ...]]] = {
+            "Re-plan": (self._plan_again, *PLANNING[:2]),
+            "Simulate": (self._run_physics, *EXECUTION[:1]),
+            "Save": (self._save, *EXECUTION[1:]),
+            "Undo": (self._undo,),
+            "Undo all": (self._forget,),
         }
-        self._handles = {n: gui.add_button(n) for n in self._buttons}
+        self._handles = {n: gui.add_button(n) for n in buttons}
         self._work = Work(gui, self._tell)
         self._gizmo = page.server.scene.add_transform_controls(
             "/edit/contact",
@@ -245,8 +246,8 @@ class Editor:
         self._height.on_update(lambda _: self._resized())
         for surface, box in self._use.items():
             box.on_update(lambda _, s=surface: self._switched(s))
-        for name, job in self._buttons.items():
-            self._handles[name].on_click(lambda _, job=job: self._do(job))
+        for name, job in buttons.items():
+            self._handles[name].on_click(lambda _, job=job: self._do(*job))
         self._tell()
 
     # What is chosen, and where it is.
@@ -355,7 +356,7 @@ class Editor:
     # What is said and done.
 
     def _tell(self) -> None:
-        """What is edited, what came of it, and what can be done now."""
+        """Show the edits, the result, and which buttons can be pressed."""
         said = []
         for name, (support, place) in self._edits.moved.items():
             x = self._intervals[name]
@@ -380,8 +381,8 @@ class Editor:
         for name, possible in can.items():
             self._handles[name].disabled = busy or not possible
 
-    def _do(self, job: Callable[[], str]) -> None:
-        self._came_of_it = self._work.do(job)
+    def _do(self, job: Callable[[], str], *stages: str) -> None:
+        self._came_of_it = self._work.do(job, *stages)
         self._tell()
 
     def _plan_again(self) -> str:
@@ -398,10 +399,9 @@ class Editor:
         verdict = judge(self._new, rollout)
         self._done = (rollout, verdict)
         self._replaced(self._new, rollout)
-        failed = [n for n, c in verdict.criteria.items() if not c.ok]
         if verdict.reached:
             return "Physics: success."
-        return f"Physics: failed ({', '.join(failed)})."
+        return f"Physics: failed; not met: {verdict.failed()}."
 
     def _save(self) -> str:
         assert self._new is not None

@@ -59,7 +59,7 @@ PERSON: Colour = (0.20, 0.42, 0.68, 1.0)
 PERSON_BOX: Colour = (0.84, 0.80, 0.74, 1.0)
 PERSON_JOINT: Colour = (0.13, 0.29, 0.49, 1.0)
 BONE, JOINT, HEAD = 0.030, 0.040, 0.10  # [m] radii at the person's own size
-ROOM = 0.15  # [height of the motion] between the two
+ROOM = 0.35  # [height of the motion] between the two
 
 
 class Person:
@@ -128,11 +128,11 @@ class Person:
 
 
 def skeleton_of_plan(plan: Plan) -> Skeleton | None:
-    """The recording that a plan was made of; None where it is not to be found.
+    """The recording that a plan goes back to, by way of a policy too.
 
-    None, too, of a plan that follows a policy: nobody made those contacts.
+    None where it is not to be found, or where there are several.
     """
-    name = None if plan.policy else recording_named(plan.sequence.source)
+    name = recording_named(plan.sequence.source)
     if name is None:
         return None
     try:
@@ -147,7 +147,7 @@ def _middle(x: np.ndarray) -> float:
 
 
 def speedup_of(duration: float) -> int:
-    """How much faster than it was a run of that many seconds is shown."""
+    """By how much a run of that many seconds is sped up."""
     speedup = 1
     while duration > SPEEDUP_AFTER and duration / speedup > VIDEO_SECONDS:
         speedup *= 2
@@ -235,7 +235,7 @@ def _frames(
     person, paired = None, None
     if skeleton is not None:
         person = Person(skeleton, world, seen, camera)
-        paired = paired_times(plan, reached, duration)
+        paired = paired_times(plan, reached, duration, skeleton)
     beside = None if person is None else person.points
     view = view_of(world, seen, size[0] / size[1], camera, beside)
     letters = max(14, round(size[1] / 32))

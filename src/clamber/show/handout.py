@@ -36,20 +36,20 @@ class Handout:
             shown: What is on the page at present; None: nothing that could be drawn.
         """
         self._page, self._folder, self._shown = page, folder, shown
-        self._add("Report: plots, tables, criteria", self._report)
+        self._add("Report: plots, tables, criteria", self._report, "report")
         if shown is not None:
-            self._add("Picture of this view", self._picture)
-            self._add("Video", self._video)
+            self._add("Picture of this view", self._picture, "draw")
+            self._add("Video", self._video, "video")
         self._work = Work(page.server.gui)
 
-    def _add(self, label: str, make: Callable[[Any, Path], Path]) -> None:
-        """A button that makes a file."""
+    def _add(self, label: str, make: Callable[[Any, Path], Path], stage: str) -> None:
+        """A button that makes a file; the stage is what there is to wait for."""
         button = self._page.server.gui.add_button(label)
 
         @button.on_click
         def _(event: Any) -> None:
             if event.client is not None:
-                self._work.do(lambda: self._send(event.client, make))
+                self._work.do(lambda: self._send(event.client, make), stage)
 
     def _send(self, client: Any, make: Callable[[Any, Path], Path]) -> str:
         """Make a file, and hand it out under the name of the run."""

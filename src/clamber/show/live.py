@@ -6,7 +6,7 @@ What is only read (plots, tables, criteria) is in the report, which the page han
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Verdict
 from clamber.model.arguments import checks_types
 from clamber.model.terrain import SceneLike
 from clamber.planning.records import Plan
@@ -152,7 +153,7 @@ def _person_of(
 def _show_run(
     page: Page, run: Run, others: Sequence[Run] = (), person: Skeleton | None = None
 ) -> None:
-    """The page of a run folder: of its motion, else of its recording, else of words."""
+    """The page of a run folder: its motion, else its recording, else text."""
     notes = (fallback_note(run.written), run.execution.get("stopped", ""))
     page.begin(run.folder.resolve().name, run.missing, notes)
     if run.verdict:
@@ -175,22 +176,19 @@ def _show_recording(page: Page, skeleton: Skeleton) -> None:
     page.span(float(demo.t[0]), float(demo.t[-1]), skeleton.changes())
 
 
-def _add_verdict(page: Page, verdict: Mapping[str, Any]) -> None:
-    """Whether the robot got there, and each criterion: fields of `verdict.json`."""
-    reached, gui = bool(verdict.get("reached")), page.server.gui
-    colour = "#16a34a" if reached else "#dc2626"
-    said = "reached the goal" if reached else "did not make it"
+def _add_verdict(page: Page, verdict: Verdict) -> None:
+    """Success or failure, and each criterion."""
+    gui = page.server.gui
+    colour = "#16a34a" if verdict.reached else "#dc2626"
+    said = "reached the goal" if verdict.reached else "failed"
     gui.add_html(
         f'<p style="margin: 4px 12px; font-weight: 600; color: {colour}">{said}</p>'
     )
     rows = (
-        (
-            name if c["ok"] else f"{name}: NOT MET",
-            f"{c['value']:.4g} / {c['limit']:.4g}",
-        )
-        for name, c in verdict.get("criteria", {}).items()
+        (label if ok else f"{label}: NOT MET", value, limit)
+        for label, value, limit, ok in verdict.rows()
     )
-    with gui.add_folder("Verdict: value / limit", expand_by_default=False):
+    with gui.add_folder("Verdict: value, limit", expand_by_default=False):
         gui.add_html(rows_of(rows))
 
 
@@ -209,7 +207,6 @@ class _RunPage:
         self._page, self._plan, self._rollout = page, plan, run.rollout
         self._layers = dict(LAYERS)
         self._stage = self._first = Stage(page.server, plan, run.rollout, "/run")
-        self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
         self._count, self._figure, gui = 0, None, page.server.gui
         scene = self._stage.motion.world.scene
         self._points = self._stage.seen()
@@ -227,6 +224,7 @@ class _RunPage:
             person = thinned(skeleton.position, 60).reshape(-1, 3)
             offset = to_the_right(scene, self._points, skeleton.demo.scene, person)
             self._figure = Figure(page.server, skeleton, offset)
+        self._pair(plan)
         self._look()
         page.follow(lambda t: self._stage.base(t))
         with page.layers:
@@ -236,7 +234,7 @@ class _RunPage:
         self._chart = Chart(page, lambda: self._stage.motion)
         with gui.add_folder("Edit", expand_by_default=False):
             Editor(page, run.folder, plan, self.replace)
-        with gui.add_folder("Take away", expand_by_default=False):
+        with gui.add_folder("Export", expand_by_default=False):
             Handout(page, run.folder, lambda: (self._plan_shown, self._rollout_shown))
         self._plan_shown, self._rollout_shown = plan, run.rollout
         if others:
@@ -258,13 +256,19 @@ class _RunPage:
                 server = self._page.server
                 self._stage = Stage(server, plan, rollout, name, before=self._first)
             self._plan_shown, self._rollout_shown = plan, rollout
-            self._paired = paired_times(plan, self._stage.reached, self._stage.duration)
+            self._pair(plan)
             self._first.root.visible = self._stage is self._first
             if before is not self._first:
                 before.root.remove()
             # First: what is sent to a plot just before it goes, the browser misses.
             self._chart.renew()
             self._span()
+
+    def _pair(self, plan: Plan) -> None:
+        """Synchronise the person with the robot."""
+        if self._figure is not None:
+            stage, person = self._stage, self._figure.skeleton
+            self._paired = paired_times(plan, stage.reached, stage.duration, person)
 
     def _span(self) -> None:
         """As long as the longest of what is shown; the contacts of the first."""

@@ -62,7 +62,7 @@ def font(size: int) -> Any:
 def contact_marks(
     kin: Kinematics, loaded: np.ndarray, forces: np.ndarray | None
 ) -> list[Mark]:
-    """Where a robot bears on something at its present posture.
+    """The loaded contacts of a robot at its present posture.
 
     Args:
         kin: The robot.
@@ -169,7 +169,7 @@ def arrow(
 
 
 def loads_of(rollout: Rollout, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(k, nS) bool, what bears in rows (k,) of a rollout, and (k, nS, 3) [N] forces.
+    """(k, nS) bool, what is loaded in rows (k,) of a rollout, and (k, nS, 3) [N].
 
     Forces shake from one millisecond to the next: those of a row are the mean of what
     is recorded up to `SMOOTHED` before and after it.

@@ -168,16 +168,14 @@ def _rollout(rollout: Rollout) -> _Cell:
 
 def _verdict(verdict: Verdict) -> _Cell:
     rows = [["criterion", "value", "limit", ""]]
-    for name, c in verdict.criteria.items():
-        ok = "ok" if c.ok else "NO"
-        rows.append([str(name), f"{c.value:.4g}", f"{c.limit:.4g}", ok])
+    rows += [[*row, "ok" if ok else "NO"] for *row, ok in verdict.rows()]
     line = "Verdict: " + ("reached" if verdict.reached else "not reached")
     return line, rows, _bars(verdict)
 
 
 def _bars(verdict: Verdict) -> bytes:
     """Each value as a share of its limit."""
-    names = [str(n) for n in verdict.criteria]
+    names = [f.label for f in verdict.criteria]
     shares = [
         c.value / c.limit if c.limit else c.value for c in verdict.criteria.values()
     ]

@@ -21,6 +21,7 @@ import numpy as np
 
 from clamber.errors import ClamberError, InputError
 from clamber.show.renderer import PRESETS, Preset, View, frame_view
+from clamber.show.track import Track
 
 FRAMES_A_SECOND = 30
 PANEL_SECONDS = 0.2  # [s] between two states of the panel while it plays
@@ -35,7 +36,7 @@ SECTIONS, CELLS = (150, 157, 166), (176, 183, 192)  # of the ground, light and d
 
 
 class Clock:
-    """Time that plays, is scrubbed and stepped, and what is told of it."""
+    """Playback time: play, scrub and step; callbacks are told of each change."""
 
     def __init__(self, show: Callable[[float], None]) -> None:
         """Nothing to show yet.
@@ -317,7 +318,7 @@ class Page:
             self.aim(client)
 
     def _carry(self, t: float) -> None:
-        """Have the cameras go the way of the robot."""
+        """Move the cameras along with the robot."""
         if self._where is None:
             return
         at = self._where(t)
@@ -351,7 +352,7 @@ class Page:
 
 
 class Work:
-    """One thing at a time that takes a while: how far it is, and what came of it."""
+    """A job at a time, with its progress bar and its result."""
 
     def __init__(self, gui: Any, changed: Callable[[], None] = lambda: None) -> None:
         """Add a bar and a line to the panel.
@@ -369,16 +370,20 @@ class Work:
         """Whether something is being done."""
         return self._busy.locked()
 
-    def do(self, job: Callable[[], str]) -> str:
+    def do(self, job: Callable[[], str], *stages: str) -> str:
         """Do it, unless something is being done; what goes wrong is said, not thrown.
 
         Args:
             job: Returns what is to be said in the end.
+            stages: Of it, in order, which it reports; none of what is done at once.
         """
         if not self._busy.acquire(blocking=False):
             return ""
         self._changed()
+        self._track = Track(*stages)
         try:
+            if stages:
+                self.report(stages[0], 0.0, "")
             said = job()
         except (ClamberError, OSError) as e:
             said = str(e)
@@ -390,9 +395,11 @@ class Work:
 
     def report(self, stage: str, share: float, note: str) -> None:
         """How far it is: a stage, its share, and what is at hand."""
+        self._track.update(stage, share)
         self._bar.visible = True
-        self._bar.value = 100.0 * min(max(share, 0.0), 1.0)
-        self.say(f"{stage}: {note}" if note else stage)
+        self._bar.value = 100.0 * self._track.share
+        left = f" ({self._track})" if str(self._track) else ""
+        self.say((f"{stage}: {note}" if note else stage) + left)
 
     def say(self, *texts: str) -> None:
         """Have these lines there, in place of those before."""
@@ -400,7 +407,7 @@ class Work:
 
 
 def check_address(host: str, port: int) -> None:
-    """Whether this machine can listen there: viser would try on and on.
+    """Check that this machine can listen there: viser would retry without end.
 
     Raises:
         InputError: It is no port, or the host is none of this machine.
@@ -430,13 +437,11 @@ def paragraphs(texts: Sequence[str]) -> str:
     return f'<div style="font-size: 13px; padding: 0 12px">{lines}</div>'
 
 
-def rows_of(pairs: Iterable[tuple[str, str]]) -> str:
-    """A table of two columns as HTML; the texts are no markup."""
+def rows_of(rows: Iterable[Sequence[str]]) -> str:
+    """A table as HTML; the texts are no markup."""
     cell = '<td style="padding: 1px 12px 1px 0; vertical-align: top">'
-    rows = "".join(
-        f"<tr>{cell}{html.escape(a)}</td>{cell}{html.escape(b)}</td></tr>"
-        for a, b in pairs
-    )
+    lines = ("".join(f"{cell}{html.escape(x)}</td>" for x in row) for row in rows)
+    rows = "".join(f"<tr>{line}</tr>" for line in lines)
     return f'<table style="font-size: 13px; margin: 4px 12px">{rows}</table>'
 
 

@@ -32,7 +32,7 @@ SURFACE_COLOURS = ("#c2410c", "#1d4ed8")  # of a limb's surfaces, the outer one 
 def demonstration_plot(
     demonstration: Demonstration, sequence: ContactSequence, path: str | Path
 ) -> Path:
-    """Heights of the person's parts over time, what was found to be contact in bold."""
+    """Heights of the person's parts over time, detected contacts in bold."""
     t = demonstration.t
     tracks = {p: demonstration.point(p)[:, 2] for p in _PARTS.values() for p in p}
     contact = {
@@ -44,7 +44,7 @@ def demonstration_plot(
 
 
 def contact_plot(motion: Motion, path: str | Path) -> Path:
-    """Heights of the robot's surfaces, bold where they bear load."""
+    """Heights of the robot's surfaces, bold where they are loaded."""
     robot, names = motion.world.robot, list(motion.world.surfaces)
     tracks = {s: motion.points[:, i, 2] for i, s in enumerate(names)}
     contact = dict(zip(names, motion.loads or motion.schedule, strict=True))
@@ -99,7 +99,7 @@ def stability_plot(motion: Motion, asked: float, path: str | Path) -> Path:
 
     Args:
         motion: Of physics, or of a plan.
-        asked: Margin of the centre of mass that is asked of keyframes [m].
+        asked: CoM margin required at keyframes [m].
         path: The file.
     """
     t, margin = motion.time, motion.margin
@@ -121,9 +121,9 @@ def stability_plot(motion: Motion, asked: float, path: str | Path) -> Path:
         ax.set_ylabel("d [m]; dashed: guide value", fontsize=8)
         finish_axes(ax)
     ax = fig.add_subplot(grid[2, :])
-    ax.plot(t, margin, color="0.15", lw=1.2, label="CoM inside the support polygon")
+    ax.plot(t, margin, color="0.15", lw=1.2, label="CoM margin in the support polygon")
     ax.axhline(0.0, color="#b91c1c", lw=1, ls="--", label="its border")
-    ax.axhline(asked, color="#15803d", lw=1, ls="--", label="asked of keyframes")
+    ax.axhline(asked, color="#15803d", lw=1, ls="--", label="required at keyframes")
     ax.set_xlim(t[0], t[-1])
     ax.set_xlabel("time [s]")
     ax.set_ylabel("margin [m]", fontsize=8)
@@ -270,7 +270,7 @@ def pelvis_plot(policy: GeneralPolicy, path: str | Path) -> Path:
 
 
 def _draw_angle(ax: Axes, d: PelvisDistribution, k: int, seen: np.ndarray) -> None:
-    """One density [1/deg], what is imposed of it, and the samples."""
+    """One density [1/deg], its imposed range, and the samples."""
     mean, sigma = math.degrees(d.mean[k]), math.degrees(d.sigma[k])
     imposed = d.imposed[k]
     ax.plot(np.degrees(seen), np.zeros(len(seen)), "|", color="0.5", ms=7)

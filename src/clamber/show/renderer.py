@@ -1,4 +1,4 @@
-"""Pictures of a world without a screen, and cameras that have all of it in view.
+"""Offscreen rendering of a world, and cameras that have all of it in view.
 
 MuJoCo's own renderer draws, through EGL where there is one, else OSMesa. What is drawn
 depends on the records alone; the same run gives the same picture.

@@ -178,8 +178,8 @@ def run_record(folder: Path) -> dict[str, Any]:
         "facts": _facts(written),
         "mass": None if plan is None else plan.world.mass,
         "missing": run.missing,
-        "reached": run.verdict.get("reached"),
-        "criteria": _criteria(run.verdict),
+        "reached": None if run.verdict is None else run.verdict.reached,
+        "criteria": None if run.verdict is None else run.verdict.rows(),
         "events": run.execution.get("events", []),
         "stopped": run.execution.get("stopped", ""),
         "fell": run.execution.get("fell", False),
@@ -206,12 +206,6 @@ def _facts(written: Mapping[str, Any]) -> list[str]:
         f"{b['friction']:g}"
         for b in boxes[:3]
     ]
-
-
-def _criteria(verdict: Mapping[str, Any]) -> list[dict[str, Any]] | None:
-    if not verdict:
-        return None
-    return [{"name": n, **c} for n, c in verdict["criteria"].items()]
 
 
 def _flat(x: Any, name: str = "") -> list[tuple[str, Any]]:

@@ -1,4 +1,4 @@
-"""A run folder -> what there is to see of it: its records, and arrays over time.
+"""A run folder -> what is shown of it: records, and arrays over time.
 
 A run whose files are broken or missing is read as far as it can be, and what is not
 there is named. What is shown, in a report or a view, comes from here.
@@ -20,6 +20,7 @@ from clamber.contact.contact import Contact
 from clamber.contact.steps import Step
 from clamber.errors import ClamberError, InputError
 from clamber.execution.simulation import Rollout
+from clamber.execution.verdict import Verdict
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.scene import Support
@@ -40,6 +41,7 @@ from clamber.run.folder import (
     load_fields,
     load_plan,
     load_rollout,
+    load_verdict,
 )
 from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import Keyframe
@@ -68,19 +70,19 @@ class Run:
     Attributes:
         folder: The run folder.
         missing: A sentence for each thing that could not be read.
-        written, execution, verdict, timings: Fields of the JSON files; empty where they
-            are missing.
-        plan, rollout: None where their files are.
+        written, execution, timings: Fields of the JSON files; empty where they are
+            missing.
+        plan, rollout, verdict: None where their files are.
     """
 
     folder: Path
     missing: list[str] = field(default_factory=list)
     written: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)
-    verdict: Mapping[str, Any] = field(default_factory=dict)
     timings: Mapping[str, Any] = field(default_factory=dict)
     plan: Plan | None = None
     rollout: Rollout | None = None
+    verdict: Verdict | None = None
 
     __repr__ = short_repr
 
@@ -129,7 +131,7 @@ def read_run(folder: Path) -> Run:
     if ran or run.has(EXECUTION):
         run.execution = run.fields(EXECUTION)
     if ran or run.has(VERDICT):
-        run.verdict = run.fields(VERDICT)
+        run.verdict = run.attempt(lambda: load_verdict(folder))
     run.timings = run.fields(TIMINGS)
     if run.written and not ran:
         text = "the plan has not been run in physics"
@@ -318,13 +320,13 @@ class Motion:
 
     @property
     def bears(self) -> np.ndarray:
-        """(n, nS) bool, what bears load: in physics, else as planned."""
+        """(n, nS) bool, which surfaces are loaded: in physics, else as planned."""
         found = self.planned if self.loaded is None else self.loaded
         assert found is not None  # there is one of them
         return found
 
     def phase(self, row: int, surface: int) -> Phase | None:
-        """Of a contact that is planned or bears at a sample; None where there is none.
+        """Of a contact that is planned or loaded at a sample; None where there is none.
 
         Args:
             row: Index of the sample.
@@ -340,7 +342,7 @@ class Motion:
 
 
 def swings_of(motion: Motion, trajectory: Trajectory) -> list[tuple[float, np.ndarray]]:
-    """When contacts are made [s], and the ways (m, 3) of their surfaces there [m]."""
+    """When contacts are made [s], and the swing paths (m, 3) of their surfaces [m]."""
     names, time = list(motion.world.surfaces), trajectory.time
     out = []
     for s in trajectory.segments:
@@ -501,7 +503,7 @@ def stability_of(
 
 
 def bearing_of(kin: Kinematics, surface: str, support: Support) -> np.ndarray:
-    """(k, 3) points of a surface that bear on a support; the nearest one at least."""
+    """(k, 3) points of a surface that touch a support; the nearest one at least."""
     points = kin.bearing_points(surface, support.normal)
     gaps = support.height(points)
     return points[gaps <= max(TOUCHING, float(gaps.min()))]
@@ -534,7 +536,7 @@ def posture_at(motion: Motion, q: np.ndarray, t: float) -> np.ndarray:
 
 
 def support_polygon_at(motion: Motion, kin: Kinematics, row: int) -> np.ndarray:
-    """(K, 3) support polygon of what bears at a sample, at its highest contact [m].
+    """(K, 3) support polygon of the loaded contacts, at the highest of them [m].
 
     Args:
         motion: The run.

@@ -39,6 +39,7 @@ from clamber.show.skeleton import Skeleton
 # One level of meshes, at rest and in motion, that a processor draws in time too.
 TRIANGLES, DEVIATION = 15_000, 0.0008  # [m] that faces may be off a round geom
 ALIKE, ALIKE_TURNED = 0.004, 0.02  # [m], [rad] that are not seen between two poses
+MOST = 3000  # samples of a long run: two minutes at 25 Hz, ten at 5 Hz
 GHOST, BEFORE, GHOST_OPACITY = (59, 130, 246), (217, 70, 239), 0.3
 SEE_THROUGH = 0.45
 BEFORE_EDITING = "before editing"  # the layer of the plan as it was
@@ -93,20 +94,20 @@ class Bodies:
             frame.visible = on
 
     def fade(self, opacity: float | None) -> None:
-        """How much of them is to be seen; None: all."""
+        """Their opacity, 0 to 1; None: opaque."""
         for part in self._parts:
             part.opacity = opacity
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(nb,) whether bodies with poses (nb, 7) can be told from those of others."""
+    """(nb,) whether bodies with poses (nb, 7) visibly differ from others."""
     cosine = np.minimum(np.abs(np.sum(a[:, 3:] * b[:, 3:], axis=1)), 1.0)
     off = np.linalg.norm(a[:, :3] - b[:, :3], axis=1)
     return (off > ALIKE) | (2 * np.arccos(cosine) > ALIKE_TURNED)
 
 
 class Ghost:
-    """A robot as it would be elsewhere in time: pale, where it is not as it is."""
+    """A half-transparent robot, as planned or before editing, where the two differ."""
 
     def __init__(
         self,
@@ -172,7 +173,7 @@ class Stage:
             root: Name of the node that all hang in.
             before: Whose robot is shown too on request, as it is at the same time.
         """
-        self.motion = m = sample_motion(plan, rollout, {})
+        self.motion = m = sample_motion(plan, rollout, {}, MOST)
         self.reached = keyframe_times(plan, rollout)
         self.changes = [f"stance {c.step.stance}: {c.step}" for c in plan.changes]
         as_planned = rollout is None or rollout.followed is None
@@ -254,7 +255,7 @@ class Stage:
         under_way = change_at(self.changes, self.reached, t)
         facts = [f"{t:.2f} of {self.duration:.1f} s; {under_way}"]
         if math.isfinite(m.margin[row]):
-            facts.append(f"centre of mass {1000 * m.margin[row]:.0f} mm inside")
+            facts.append(f"CoM margin {1000 * m.margin[row]:.0f} mm")
         return paragraphs(facts)
 
     def seen(self) -> np.ndarray:
@@ -319,7 +320,7 @@ class Figure:
             skeleton: The recording.
             offset: (3,) where its world is put [m].
         """
-        add, self._skeleton, self._offset = server.scene, skeleton, offset
+        add, self.skeleton, self._offset = server.scene, skeleton, offset
         self.root = add.add_frame("/person", show_axes=False, position=offset)
         for i, box in enumerate(skeleton.demo.scene.boxes):
             add.add_box(
@@ -338,11 +339,11 @@ class Figure:
 
     def seen(self) -> np.ndarray:
         """(n, 3) points that a camera has to have in view [m]."""
-        return thinned(self._skeleton.position, 60).reshape(-1, 3) + self._offset
+        return thinned(self.skeleton.position, 60).reshape(-1, 3) + self._offset
 
     def show(self, t: float) -> str:
         """Put the person where it is; bones that were not seen are not shown."""
-        skeleton = self._skeleton
+        skeleton = self.skeleton
         p, seen = skeleton.at(t)
         bones = skeleton.bones[seen[skeleton.bones].all(axis=1)]
         self._bones.visible = len(bones) > 0

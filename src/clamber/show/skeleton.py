@@ -5,13 +5,19 @@ Shapes: T samples, F points, B bones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from clamber.contact.contact import ContactInterval, ContactSequence
+from clamber.contact.contact import (
+    ContactInterval,
+    ContactSequence,
+    Region,
+    region_of,
+)
 from clamber.model.records import short_repr
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
@@ -133,26 +139,55 @@ def corners(scene: Scene) -> np.ndarray:
 
 
 def paired_times(
-    plan: Plan, reached: Sequence[float | None], end: float
+    plan: Plan, reached: Sequence[float | None], end: float, person: Skeleton
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times (n,) of robot and person at which they make the same contact [s].
 
-    Between them the one clock is the other one, stretched.
+    A policy makes contacts of its own: there the two leave the ground at the same time,
+    are wholly on top, and back on the ground, as far as they do so in the same order.
+    Between these times the one clock is the other one, stretched.
 
     Args:
         plan: What was to be done.
         reached: When each keyframe is reached [s].
         end: Of the robot's motion [s].
+        person: Whom the plan goes back to.
     """
-    t = plan.sequence.t
-    robot, person = [0.0], [float(t[0])]
-    for change, at in zip(plan.changes, reached[1:], strict=True):
-        if change.step.index is None or at is None:
-            continue
-        if at > robot[-1]:
-            robot.append(at)
-            person.append(float(t[change.step.stance]))
-    if end > robot[-1]:
-        robot.append(end)
-        person.append(float(t[-1]))
-    return np.array(robot), np.array(person)
+    if plan.policy is not None and person.sequence is not None:
+        pairs, last = _at_regions(plan, reached, person.sequence)
+    else:
+        t = plan.sequence.t
+        pairs, last = [(0.0, float(t[0]))], float(t[-1])
+        for change, at in zip(plan.changes, reached[1:], strict=True):
+            if change.step.index is not None and at is not None and at > pairs[-1][0]:
+                pairs.append((at, float(t[change.step.stance])))
+    if end > pairs[-1][0]:
+        pairs.append((end, last))
+    robot, other = zip(*pairs, strict=True)
+    return np.array(robot), np.array(other)
+
+
+def _at_regions(
+    plan: Plan, reached: Sequence[float | None], person: ContactSequence
+) -> tuple[list[tuple[float, float]], float]:
+    """Times at which both come to the same region, and where the person is after."""
+    keys = zip(reached, plan.keyframes, strict=True)
+    mine = _entered((at, region_of(k.stance)) for at, k in keys if at is not None)
+    began = person.t[:-1].tolist()
+    stances = zip(began, person.stances, strict=True)
+    theirs = _entered((t, s.region) for t, s in stances)
+    pairs = [(0.0, theirs[0][0])]
+    if mine[0][1] == theirs[0][1]:
+        for (at, region), (t, other) in zip(mine[1:], theirs[1:], strict=False):
+            if region != other or at <= pairs[-1][0]:
+                break
+            pairs.append((at, t))
+    k = len(pairs)
+    after = k == len(mine) < len(theirs)  # the robot gets no farther
+    return pairs, theirs[k][0] if after else float(person.t[-1])
+
+
+def _entered(stances: Iterable[tuple[float, Region]]) -> list[tuple[float, Region]]:
+    """When each region begins, of times with the region that one is in from then on."""
+    runs = itertools.groupby(stances, key=lambda x: x[1])
+    return [next(group) for _, group in runs]

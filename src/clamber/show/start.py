@@ -1,4 +1,4 @@
-"""The page on which a climb begins: recording, robot, something to climb, and climb.
+"""The start page: choose a recording, a robot and a scene, and climb.
 
 What is chosen is a `Climb`, the flags of `clamber climb`; the work is `run_climb`'s.
 """
@@ -30,6 +30,7 @@ from clamber.show.meshes import body_meshes, body_poses
 from clamber.show.page import Page, Work, paragraphs
 from clamber.show.renderer import robot_corners
 from clamber.show.scene3d import DEVIATION, PERSON_BOX, TRIANGLES, Bodies
+from clamber.show.track import EXECUTION, PLANNING
 from clamber.study.climb import Climb, ClimbResult, command_of, run_climb
 
 UPLOADS = Path("runs") / "uploads"
@@ -242,7 +243,7 @@ class StartPage:
             made.append(folder)
             return outcome(climb, result)
 
-        said = self._work.do(job)
+        said = self._work.do(job, "detect", *PLANNING, *EXECUTION)
         if made:
             try:
                 self._opened(made[0])
@@ -259,7 +260,9 @@ class StartPage:
 
 def outcome(climb: Climb, result: ClimbResult) -> str:
     """How it ended, and the line that does it again."""
-    ended = "The robot got there." if result.reached else f"It did not: {result.why}."
+    ended = "Success: the robot reached the goal stance."
+    if not result.reached:
+        ended = f"Failed: {result.why}."
     return f"{ended} The same from a terminal: {command_of(climb)}"
 
 

@@ -74,7 +74,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Failure:
-    """Why there is no way; as a string, a sentence.
+    """Why a step cannot be planned; as a string, a sentence.
 
     Attributes:
         status: What kind of reason it is.

@@ -99,7 +99,7 @@ class PostureProblem:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Residuals:
-    """How well a configuration satisfies a problem, computed without the solver.
+    """Residuals of a configuration, computed without the solver.
 
     Attributes:
         contact: Largest distance or angle by which a hard contact is open [m, rad].

@@ -90,7 +90,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
 def check_phases(
     ik: IK, t: Transition, postures: Sequence[np.ndarray]
 ) -> tuple[Status, str]:
-    """Overlaps and contacts at all postures and half-way between, solver aside.
+    """Overlaps and contacts at all postures and half-way, without the solver.
 
     Whether the contacts hold the robot at the postures of a swing, too: those at its
     ends the transition has looked at, and while weight shifts more contacts bear.
@@ -185,7 +185,7 @@ def interpolate(kin: Kinematics, a: np.ndarray, b: np.ndarray, s: float) -> np.n
 def bridge(
     ik: IK, a: np.ndarray, b: np.ndarray, contacts: Sequence[Contact]
 ) -> np.ndarray:
-    """(n, nq) postures from `a` to `b`, all contacts closed, near the straight way."""
+    """(n, nq) postures from `a` to `b`, all contacts closed, near the geodesic."""
     return ik.core.bridge(a, b, *packed_contacts(ik.world, contacts))
 
 

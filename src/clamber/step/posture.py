@@ -1,4 +1,4 @@
-"""What the three optimisers share: the task, its cost and the verified result.
+"""Shared by the three optimisers: the task, its cost and the verified result.
 
 The cost is the contact-stability cost of the new contacts, (4.19) with (4.25),
 

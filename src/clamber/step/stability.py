@@ -81,7 +81,7 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
 
 
 def contact_points(kin: Kinematics, contacts: Sequence[Contact]) -> ContactPoints:
-    """The points of contacts that bear force, at the present posture."""
+    """The points of contacts that carry force, at the present posture."""
     supports = [kin.world.supports[c.support] for c in contacts]
     points = [
         kin.bearing_points(c.surface, support.normal, c.edge)
@@ -101,7 +101,7 @@ def contact_points(kin: Kinematics, contacts: Sequence[Contact]) -> ContactPoint
 def statics_at(
     kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
 ) -> tuple[ContactPoints, Load, TorqueLimits]:
-    """What contacts, weight and joints are to statics at `q` (nq,).
+    """Contact points, weight and torque limits for the statics at `q` (nq,).
 
     The torques that are counted on to hold a posture are nine tenths of the effort
     limits; of joints that a contact loads, less what one costs that lies beside where
@@ -134,7 +134,7 @@ def statics_at(
 def equilibrium_at(
     kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
 ) -> StaticEquilibrium:
-    """Static equilibrium with cones and torques that are counted on at `q` (nq,)."""
+    """Static equilibrium at `q` (nq,) with the planner's cones and torque limits."""
     points, load, torque = statics_at(kin, q, contacts)
     return static_equilibrium(points, load, torque=torque)
 
@@ -148,7 +148,7 @@ def is_stable(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> bo
 
 
 def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> str:
-    """Which joint is too weak where contacts do not hold the robot at `q` (nq,)."""
+    """Which joint is too weak where there is no static equilibrium at `q` (nq,)."""
     points, load, torque = statics_at(kin, q, contacts)
     needed = strength_needed(points, load, torque)
     if needed is None:

@@ -102,7 +102,7 @@ def contact_phase(d: float, l: float, theta_max: float, *, loaded: bool) -> Phas
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ContactPoints:
-    """Where the supports can push.
+    """Contact points with normals and friction.
 
     Attributes:
         points: (nc, 3) [m].
@@ -134,7 +134,7 @@ class ContactPoints:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Load:
-    """What the contacts bear.
+    """The wrench that the contacts carry.
 
     Attributes:
         com: (3,) centre of mass [m].
@@ -149,7 +149,7 @@ class Load:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TorqueLimits:
-    """What the joints can bear: |g - J^T f| <= limits, joint by joint.
+    """Torque limits: |g - J^T f| <= limits, joint by joint.
 
     Attributes:
         jacobian: (3 nc, nv) of the contact points, stacked, in the world frame.
@@ -295,7 +295,7 @@ def contact_forces(
 def static_equilibrium(
     contacts: ContactPoints, load: Load, *, torque: TorqueLimits | None = None
 ) -> StaticEquilibrium:
-    """Judge a posture by forces: the check that does not depend on how it was found.
+    """Judge a posture by forces, independently of how it was found.
 
     The horizontal pushes at the centre of mass that the stance can bear, within the
     friction cones and torque limits, are a convex polygon; the margin is the signed

@@ -1,4 +1,4 @@
-"""What a surface of a posture may be asked for, and how the core is told.
+"""Tasks of surfaces in a posture, and how they are passed to the core.
 
 The rows of these tasks are the core's (src/native/tasks.cpp). A round surface touches
 under its centre. Where it is closed on its support it rolls: the contact moves with the
@@ -101,7 +101,7 @@ class Sliding:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Reaching:
-    """A surface in the air, on its way.
+    """A surface in swing.
 
     Attributes:
         contact: Where it should be, and what it goes to.
@@ -128,7 +128,7 @@ def closed(world: World, c: Contact, *, loaded: bool = True) -> Closed | OnEdge:
 
 
 def sliding(world: World, c: Contact, reference: float, **more: Any) -> Sliding:
-    """A contact that is closed on its support, and liked where it is."""
+    """A contact that is closed on its support, preferably where it is."""
     flat, R = _flat(c), _rotation(world, c)
     return Sliding(contact=flat, rotation=R, reference=reference, **more)
 

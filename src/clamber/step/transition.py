@@ -209,7 +209,7 @@ def eased_contacts(
     *,
     margin: float = MARGINS[-1],
 ) -> tuple[tuple[Contact, ...], Seeds] | None:
-    """Where earlier contacts should have been for a move to work.
+    """Where earlier contacts should have been for a step to be feasible.
 
     Solves the move's weight shift with these contacts free on their supports; where
     that works as they are, the posture in which the new contact closes.
@@ -283,7 +283,7 @@ def approach_contact(
     q: np.ndarray,
     hint: np.ndarray | None = None,
 ) -> tuple[Contact, Solution]:
-    """The nearest contact to `wanted` that closes while the others bear the weight.
+    """The nearest contact to `wanted` that closes while the others carry the weight.
 
     Args:
         ik: Workspace.

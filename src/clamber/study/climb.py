@@ -98,7 +98,7 @@ class Climb:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClimbResult:
-    """What became of a climb.
+    """The outcome of a climb.
 
     Attributes:
         reached: The verdict.
@@ -215,8 +215,10 @@ def run_climb(
         return ClimbResult(reached=False, why=f"no plan: {e}")
     verdict = judge(made, rollout)
     if folder is not None:
+        progress("save run", 0.0, "")
         save_rollout(made, rollout, folder)
         save_verdict(verdict, folder)
+        progress("save run", 1.0, "")
     wrong = [str(name) for name, c in verdict.criteria.items() if not c.ok]
     if rollout.fell:
         wrong.insert(0, "fell")
@@ -256,6 +258,8 @@ def _plan(climb: Climb, folder: Path | None, progress: Progress) -> Plan:
         progress=progress,
     )
     if folder is not None:
+        progress("save", 0.0, "")
         save_sequence(sequence, folder / SEQUENCE)
         save_plan(made, folder)
+        progress("save", 1.0, "")
     return made

@@ -58,7 +58,7 @@ class Summary:
         start: The easy end; None elsewhere.
         end: The hard end; None elsewhere.
         runs: How many.
-        reached: How many of them got there.
+        reached: How many of them succeeded.
         share: reached / runs.
         low: Of the share's 95 % Wilson interval.
         high: Likewise.
@@ -267,7 +267,7 @@ def _cell(x: Any) -> Any:
 
 
 def _draw_bins(ax: Axes, controller: str, mine: Sequence[Bin]) -> None:
-    """Points with upright intervals; how wide a bin is, lying."""
+    """Points with vertical intervals, and the bins' widths as horizontal bars."""
     x = [b.middle for b in mine]
     share = np.array([b.share for b in mine])
     ends = np.array([[b.share - b.low, b.high - b.share] for b in mine]).reshape(-1, 2)
@@ -304,7 +304,7 @@ def _draw_fit(ax: Axes, spec: Spec, strand: Strand, fit: Break | None) -> None:
 
 
 def _draw_runs(ax: Axes, name: str, strand: Strand, rows: Rows) -> None:
-    """A tick for each run: above, it got there; below, it did not."""
+    """A tick for each run: above where it succeeded, below where it failed."""
     colour = COLOURS[strand.controller]
     x = [run.factors[name] for run, _ in rows]
     y = [1.04 if outcome.reached else -0.04 for _, outcome in rows]

@@ -1,4 +1,4 @@
-"""How often it worked, and where it breaks: shares and curves with their intervals.
+"""Success rates and break points: shares and curves with their intervals.
 
 Levels run from the easy end of a factor, u = 0, to the hard one, u = 1.
 """

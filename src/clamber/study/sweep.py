@@ -326,7 +326,7 @@ def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
 
 
 def _begin_worker(coordinator: int) -> None:
-    """In a worker: leave Ctrl-C to the coordinating process, but do not outlive it."""
+    """In a worker: leave Ctrl-C to the coordinating process, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

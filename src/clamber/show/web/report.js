@@ -7,6 +7,7 @@ const DATA = JSON.parse(document.getElementById("data").textContent);
 const RUNS = DATA.runs;
 const PALETTE = ["#2563eb", "#0891b2", "#c2410c", "#d97706", "#7c3aed", "#db2777", "#15803d", "#65a30d", "#475569", "#b91c1c"];
 const PHASES = { supporting: "#16a34a", "reach-to-supportable": "#eab308", sliding: "#4f46e5" };
+const PHASE_NAMES = { supporting: "supporting", "reach-to-supportable": "reach-to-support", sliding: "beyond the contact-angle guide value" };
 const NONE = -32768;
 
 // An element with attributes, listeners (`onclick`) and children; text is text.
@@ -222,7 +223,7 @@ function section(title, className, make, note) {
 }
 
 function heading(run, motion) {
-  const badge = run.reached === null ? ["plan only", "open"] : run.reached ? ["reached the goal", "good"] : ["did not make it", "bad"];
+  const badge = run.reached === null ? ["plan only", "open"] : run.reached ? ["reached the goal", "good"] : ["failed", "bad"];
   const facts = [];
   if (motion && !motion.stills) facts.push(`${fixed(motion.end, 1)} s`);
   if (run.keyframes.length) facts.push(`${run.keyframes.length} stances`);
@@ -234,7 +235,7 @@ function heading(run, motion) {
     run.stopped && el("p", { class: "warn" }, `Stopped on the way: ${run.stopped}`),
     run.fell && el("p", { class: "warn" }, "The robot fell; the run ends there."),
     run.instead && el("p", { class: "note" }, run.instead),
-    run.adapted && el("p", { class: "note" }, "The plan was adapted on the way: “planned” below is what was followed in the end."),
+    run.adapted && el("p", { class: "note" }, "The plan was adapted during execution: “planned” below is what was followed in the end."),
     run.missing.map((text) => el("p", { class: "warn missing" }, text)),
   ];
 }
@@ -251,7 +252,7 @@ function stage(run, motion, i) {
   canvas.addEventListener("dblclick", () => { state.camera = null; redraw(); });
   new ResizeObserver(redraw).observe(canvas);
   const legend = el("div", { class: "key" },
-    Object.entries(PHASES).map(([name, colour]) => el("span", {}, el("i", { style: { background: colour } }), name)),
+    Object.entries(PHASES).map(([name, colour]) => el("span", {}, el("i", { style: { background: colour } }), PHASE_NAMES[name])),
     motion.arrays.force && el("span", {}, "arrows: contact forces"));
   const caption = el("div", { class: "caption" });
   watchers.push((t) => {
@@ -374,11 +375,11 @@ const PLOTS = [
     most.forEach((i, k) => lines.push({ name: `${m.joints[i]} (${neat(m.effortLimits[i])} N m)`, colour: colourOf([0, 2, 4, 6, 5][k]), at: (r) => m.arrays.effort(r, i) }));
     return { lines, limits: [{ value: 1, name: "limit" }, { value: -1 }], at: [-1.08, 1.08] };
   }],
-  ["Centre of mass inside the support polygon [m]", (run, m) => {
+  ["CoM margin in the support polygon [m]", (run, m) => {
     if (!m.arrays.margin) return null;
     const lines = [{ name: m.loads ? "measured" : "planned", colour: "#2563eb", at: (r) => m.arrays.margin(r) }];
     if (m.arrays.plannedMargin) lines.unshift({ name: "planned", colour: "#94a3b8", dashed: true, at: (r) => m.arrays.plannedMargin(r) });
-    return { lines, limits: [{ value: 0, name: "border" }, { value: m.marginAsked, name: "asked of keyframes", colour: "#16a34a" }], digits: 3 };
+    return { lines, limits: [{ value: 0, name: "border" }, { value: m.marginAsked, name: "required at keyframes", colour: "#16a34a" }], digits: 3 };
   }],
   ["Joint tracking error [rad]", (run, m) => m.arrays.error && {
     lines: [{ name: "largest", colour: "#c2410c", at: (r) => m.arrays.error(r, 0) }, { name: "root mean square", colour: "#2563eb", at: (r) => m.arrays.error(r, 1) }], limits: [], floor: 0, digits: 3 }],
@@ -434,7 +435,7 @@ function sheet(run, motion, i) {
     const canvas = el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n });
     later(canvas, () => { STILLS.push(canvas); drawStills(); });
     return el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` }, canvas,
-      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm inside, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
+      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM margin ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
   };
   const box = el("div", { class: "sheet" });
   return [box, paged(run.keyframes.length, 12, (from, to) => box.replaceChildren(...run.keyframes.slice(from, to).map((k, n) => tile(k, from + n))))];
@@ -480,7 +481,7 @@ function stances(run) {
   if (!run.keyframes.length) return el("p", { class: "note" }, "No plan.");
   const rows = (k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
-      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
+      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), PHASE_NAMES[c.phase] || c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
   const made = table(["", "contact change", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push margin [m g]", "limited by"], [], "stances"), body = made.querySelector("tbody");
   const pager = paged(run.keyframes.length, 20, (from, to) => body.replaceChildren(...run.keyframes.slice(from, to).flatMap((k, n) => rows(k, from + n))));
   const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "reason"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
@@ -489,7 +490,7 @@ function stances(run) {
 
 function verdict(run) {
   if (!run.criteria) return el("p", { class: "note" }, "Not judged: no verdict.");
-  return table(["criterion", "value", "limit", ""], run.criteria.map((c) => el("tr", { class: c.ok ? "" : "failed" }, cells([c.name, c.value, c.limit, c.ok ? "ok" : "NO"]))), "verdict");
+  return table(["criterion", "value", "limit", ""], run.criteria.map(([label, value, limit, ok]) => el("tr", { class: ok ? "" : "failed" }, cells([label, value, limit, ok ? "ok" : "NO"]))), "verdict");
 }
 function events(run, motion) {
   if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Every contact was measured where it was planned.");
