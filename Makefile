@@ -82,7 +82,7 @@ bench: $(VENV)/.has-video $(VENV)/.has-compare ## time the stages, and the same 
 
 pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a climb
 	rm -rf build/climb
-	$(BIN)/clamber climb --out build/climb
+	$(BIN)/clamber climb --video --out build/climb
 	cp build/climb/climb.png docs/climb.png
 	$(BIN)/clamber learn crossing --out build/policy/policy.json
 	cp build/policy/policy.png docs/policy.png

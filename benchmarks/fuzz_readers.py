@@ -1,11 +1,11 @@
 """Every reader with damaged files: each is read, or refused in one sentence.
 
-    python benchmarks/fuzz_readers.py [N] [READER ...]
+    python benchmarks/fuzz_readers.py [N | FROM:TO] [READER ...]
 
 N mutated copies (1000 by default) of small good files for each reader, or for those
-that are named. A crash, an answer after more than 5 s or a message that says nothing
-ends it with the seed that makes it again. Counts are printed; a run of given N is
-always the same.
+that are named; FROM:TO are those of other seeds. A crash, an answer after more than
+5 s or a message that says nothing is told with the seed that makes it again. Counts are
+printed; a run of given seeds is always the same.
 """
 
 from __future__ import annotations
@@ -167,8 +167,10 @@ def _with_another(read: Callable, first: Path, path: Path) -> object:
 
 def main(words: list[str]) -> int:
     """Run; 1 where something was found."""
-    count = int(words[0]) if words and words[0].isdigit() else 1000
-    wanted = [w for w in words if not w.isdigit()]
+    numbers = [w for w in words if w.replace(":", "").isdigit()]
+    first, _, last = (numbers or ["1000"])[0].rpartition(":")
+    seeds = range(int(first or 0), int(last))
+    wanted = [w for w in words if w not in numbers]
     found = 0
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as place:
@@ -180,7 +182,7 @@ def main(words: list[str]) -> int:
             if wanted and name not in wanted:
                 continue
             began, whole, path = time.perf_counter(), 0, folder / f"a.{suffix}"
-            for k in range(count):
+            for k in seeds:
                 seed = [k, *name.encode()]
                 raw = mutate(files[k % len(files)], np.random.default_rng(seed))
                 try:
@@ -193,8 +195,8 @@ def main(words: list[str]) -> int:
                         return 1
             seconds = time.perf_counter() - began
             sys.stdout.write(
-                f"{name}: {count} files, {whole} read, {count - whole} refused, "
-                f"{seconds:.0f} s\n"
+                f"{name}: {len(seeds)} files, {whole} read, "
+                f"{len(seeds) - whole} refused, {seconds:.0f} s\n"
             )
             sys.stdout.flush()
     return int(found > 0)

@@ -287,7 +287,7 @@ def test_an_obj_of_another_shape_is_named(tmp_path):
 
 def test_a_missing_drawing_is_named(tmp_path):
     (tmp_path / "s.yaml").write_text("boxes: gone.obj\n")
-    with pytest.raises(InputError, match=r"gone\.obj"):
+    with pytest.raises(InputError, match=r"s\.yaml, \S*gone\.obj: expected a readable"):
         load_scene(tmp_path / "s.yaml")
     with pytest.raises(InputError, match=r"gone\.xml"):
         load_scene(tmp_path / "gone.xml")

@@ -333,7 +333,7 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
     out, err = capsys.readouterr()
     saved = ["save_sequence", "plan", "save_plan", "simulate", "save_rollout", "judge"]
     assert quick_climb.calls == [*saved, "save_verdict", "render_run"]
-    assert quick_climb.drawing["with_video"] is True
+    assert "with_video" not in quick_climb.drawing  # all of it
     look = f"{tmp_path / 'a' / 'climb.png'} shows it; `clamber report {tmp_path / 'a'}`"
     assert err.splitlines()[-1].startswith(look)
     row = next(r for r in out.splitlines() if r.startswith("air -> LHand on box"))
@@ -348,6 +348,22 @@ def test_a_climb_saves_each_result_before_the_next_stage_begins(
     code = cli.main([*words, "--out", str(tmp_path / "b")])
     assert code == output.MISSED  # one hand is not on top
     assert capsys.readouterr().err.count("clamber: no OpenGL") == 1
+    for part in ("a", "b"):
+        assert (tmp_path / part / "timings.json").is_file()
+
+
+def test_a_climb_draws_what_it_is_asked_to_and_says_how_to_draw_the_rest(
+    quick_climb: SimpleNamespace, tmp_path: Path, capsys: Capture
+):
+    quick_climb.verdict = replace(quick_climb.verdict, reached=True)
+    for name, words in (("a", []), ("b", ["--video"])):
+        quick_climb.calls.clear()
+        folder = tmp_path / name
+        assert cli.main(["climb", *words, "--out", str(folder)]) == output.REACHED
+        assert ("render_run" in quick_climb.calls) == bool(words)
+        said = capsys.readouterr().out
+        assert (f"`clamber render {folder}` draws it" in said) != bool(words)
+        assert (folder / "timings.json").is_file()
 
 
 def test_the_seconds_of_a_search_are_those_of_all_of_it(

@@ -25,6 +25,7 @@ class Wanted:
         (("a number", "a.yaml", "x.y"), "a.yaml: x.y: expected a number"),
         (("a number", "a.yaml", "x.y", "b"), "a.yaml: x.y is 'b'; expected a number"),
         (("a number", "--x", None, "b"), "--x is 'b'; expected a number"),
+        (("a number", "a.yaml", "x\ny"), r"a.yaml: 'x\ny': expected a number"),
     ],
 )
 def test_an_input_error_names_what_it_knows_in_one_sentence(given, sentence):

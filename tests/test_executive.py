@@ -295,7 +295,13 @@ def test_it_stands_stably_in_the_stance_that_it_had(gone):
 
 
 def test_a_start_that_is_off_is_measured_and_the_whole_plan_made_anew(hands_plan):
-    rollout = run(hands_plan, x=-0.02, y=0.02, yaw=0.08, **EXACT)
+    off, said = Disturbance(x=-0.02, y=0.02, yaw=0.08, **EXACT), []
+    rollout = simulate(
+        hands_plan, disturbance=off, progress=lambda *x: said.append(x[::2])
+    )
+    again = [note for stage, note in said if note.startswith("planning again: ")]
+    assert {stage for stage, _ in said} == {"simulate"}
+    assert "planning again: air -> RHand on box" in again
     event = first(rollout, StartsElsewhere)
     assert event.time == pytest.approx(HOLD_START, abs=0.01)
     assert event.distance == pytest.approx(0.028, abs=3e-3)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -19,9 +21,13 @@ from clamber.execution.simulation import simulate
 from clamber.execution.verdict import judge
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import Box, Scene
+from clamber.model.world import build_world
 from clamber.planning.planner import VARIATIONS, plan
 from clamber.planning.records import PlanOptions
+from clamber.planning.search import Search
 from clamber.run.folder import save_plan, save_rollout
+from clamber.step.change import Failure
+from clamber.step.ik import IK
 from clamber.step.posture import KeyframeOptions
 from clamber.step.stability import equilibrium_at
 
@@ -153,6 +159,61 @@ def test_progress_is_reported_stage_by_stage(demo_sequence, coman):
     assert [stage for stage, _, _ in seen] == ["plan", "trajectory"]
     assert all(0.0 <= share <= 1.0 for _, share, _ in seen)
     assert "LHand on box" in seen[0][2]
+
+
+def test_each_step_that_is_tried_is_said_before_with_how_many_there_may_be(
+    demo_sequence, coman, monkeypatch
+):
+    silence, longest, notes = 0, 0, []
+
+    def fails(ik, before, step, options, method):
+        nonlocal silence, longest
+        silence += 1
+        longest = max(longest, silence)
+        return Failure(status=Status.UNREACHABLE, step=step)
+
+    def heard(stage, share, note):
+        nonlocal silence
+        silence = 0
+        notes.append(note)
+
+    monkeypatch.setattr("clamber.planning.search.change_contact", fails)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    found = plan(demo_sequence, coman, Scene.from_height(0.275), progress=heard)
+    assert not found.complete
+    assert longest == 1
+    said = "\n".join(notes)
+    for part in (
+        r"^air -> LHand on box$",
+        r"^weights 3 of 7, step 2 of 6: air -> RHand on box$",
+        r"^alternative 4 of 4 \(\w+, \w+\): weights 7 of 7, step 4 of 4: ",
+        r"^other contacts, search 1 of 1: step 1 of at most 100: ",
+        r"step 9 of at most 100, \d+ s more at this pace: ",
+    ):
+        assert re.search(part, said, re.MULTILINE), part
+
+
+def test_while_another_thread_tries_what_it_says_is_passed_on(coman, monkeypatch):
+    ik = IK(build_world(coman, Scene.from_height(0.275)))
+    monkeypatch.setattr("clamber.planning.search.SILENCE", 0.001)
+    monkeypatch.setattr("clamber.planning.search.threads", lambda: 2)
+    heard, passed_on = [], threading.Event()
+
+    def hear(stage, share, note):
+        heard.append(note)
+        if note == "a slow step":
+            passed_on.set()
+
+    def quick(search):
+        search.report("plan", 0.1, "a quick step")
+
+    def slow(search):
+        search.report("plan", 0.5, "a slow step")
+        assert passed_on.wait(10.0)
+
+    Search(ik, PlanOptions(), report=hear).each([quick, slow])
+    assert heard[0] == "a quick step"
+    assert set(heard[1:]) == {"a slow step"}
 
 
 # What cannot be planned.
@@ -408,7 +469,7 @@ def scaled_coman(folder: Path, scale: float) -> Path:
 def test_where_a_step_is_missed_other_weights_are_tried(
     coman, demo_sequence, monkeypatch
 ):
-    scene = at_distance(0.19, 0.42)
+    scene = Scene.from_height(0.53)
     varied = plan(demo_sequence, coman, scene)
     monkeypatch.setattr("clamber.planning.planner.VARIATIONS", ({},))
     once = plan(demo_sequence, coman, scene, contacts="demonstrated")

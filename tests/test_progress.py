@@ -138,6 +138,21 @@ def test_a_log_has_a_line_for_each_tenth_and_each_stage_and_ends_at_the_whole():
     assert max(np.diff(shares[:-1])) <= 11
 
 
+def test_a_log_says_again_what_takes_long(monkeypatch):
+    monkeypatch.setattr(progress, "QUIET", 0.01)
+    log, deadline = io.StringIO(), time.monotonic() + 10.0
+    with progress.lines(Console(file=log, width=80), progress.Track("plan")) as report:
+        report("plan", 0.01, "a step")
+        report("plan", 0.02, "another step")
+        while log.getvalue().count("another step") < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    lines = log.getvalue().splitlines()
+    assert lines[0] == "  1 % plan a step"
+    assert set(lines[1:-1]) == {"  2 % plan another step"}
+    assert lines[-1] == "100 % done"
+
+
 def test_a_terminal_shows_stage_share_and_time_left():
     screen = io.StringIO()
     console = Console(file=screen, width=100, force_terminal=True)

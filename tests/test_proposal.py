@@ -63,6 +63,15 @@ def proposed(request, tmp_path_factory):
     return proposal, robot, build_world(robot, Scene(start=np.zeros(3)))
 
 
+def test_what_is_being_done_is_said_in_order(tmp_path):
+    seen = []
+    propose_robot(described(tmp_path, "mjcf"), progress=lambda *x: seen.append(x))
+    assert {stage for stage, _, _ in seen} == {"robot"}
+    shares = [share for _, share, _ in seen]
+    assert shares == sorted(set(shares))
+    assert len(seen) >= 5
+
+
 LIMBS = {
     "mjcf": {
         "left_arm": ("v1", "v2"),
@@ -175,6 +184,24 @@ def test_lengths_scale_with_the_robot_and_gains_with_weight_times_height(tmp_pat
         kp.append(proposal.fields["gains"]["default"]["kp"])
     assert heights[1] / heights[0] == pytest.approx(1.5, rel=1e-3)
     assert kp[1] / kp[0] == pytest.approx(1.5**4, rel=0.06)
+
+
+def test_brakes_that_only_a_simulation_has_are_not_taken_and_said(tmp_path):
+    plain = propose_robot(described(tmp_path, "mjcf"))
+    brakes = 'damping="200" frictionloss="21" armature="1.5" name="'
+    text = humanoids.mjcf().replace('<joint name="', f"<joint {brakes}")
+    braked = propose_robot(described(tmp_path, "mjcf", text))
+    model = build_world(loaded(braked, tmp_path / "r"), Scene(start=np.zeros(3))).model
+    hinges = model.jnt_dofadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
+    for values, most in (
+        (model.dof_damping, 5.0),
+        (model.dof_frictionloss, 1.0),
+        (model.dof_armature, 0.3),
+    ):
+        assert set(values[hinges]) == {most}
+    said = [n for n in braked.notes if "as simulations do" in n]
+    assert [re.search(r"up to (\S+)", n)[1] for n in said] == ["200", "21", "1.5"]
+    assert not any("as simulations do" in n for n in plain.notes)
 
 
 def test_missing_effort_limits_are_guessed_said_so_or_taken_from_elsewhere(tmp_path):

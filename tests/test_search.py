@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 
 import numpy as np
@@ -143,7 +144,10 @@ def test_a_step_out_of_reach_is_skipped_with_its_reason_and_the_rest_goes_on(ik,
     (failure,) = found.failures
     assert failure.step is far
     assert failure.status is Status.UNREACHABLE
-    assert str(failure).startswith("air -> RHand on far: ")
+    assert str(failure).startswith("air -> RHand on far: a contact cannot be reached")
+    said = re.search(r"\(RHand: stays (\d+) mm from far.*stretched", failure.detail)
+    assert said is not None
+    assert 2000 < int(said[1]) < 3000  # of 4 m, less the robot's reach and the box
     assert not found.arrived
     assert len(found.keyframes) == len(found.changes) + 1 == 3
     assert surfaces(found.keyframes[-1]) == {"LFoot", "RFoot", "LHand", "RHand"}

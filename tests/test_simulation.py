@@ -35,6 +35,7 @@ from clamber.execution.verdict import (
     judge,
     measure,
     self_penetration,
+    strained_joint,
 )
 from clamber.model.scene import Scene
 from clamber.model.world import PHYSICS_STEP, build_world
@@ -395,6 +396,17 @@ def test_figures_are_those_of_the_arrays(demo_rollout, figures):
 def test_an_incomplete_plan_is_no_success(demo_plan, demo_rollout, figures):
     short = replace(demo_plan, complete=False)
     assert failed(short, demo_rollout, figures) == {Figure.COMPLETE}
+
+
+def test_the_joint_that_was_at_its_limit_for_longest_is_named(demo_rollout):
+    world, force = demo_rollout.world, 0.0 * demo_rollout.actuator_force
+    assert strained_joint(replace(demo_rollout, actuator_force=force)) is None
+    for joint, seconds, sign in (("LElbj", 0.5, 1.0), ("RShSag", 1.2, -1.0)):
+        j = world.joints.index(joint)
+        rows = round(seconds / (demo_rollout.stride * 1e-3))
+        force[:rows, world.model.actuator(joint).id] = sign * world.tau_max[j]
+    found = strained_joint(replace(demo_rollout, actuator_force=force))
+    assert found == ("RShSag", world.tau_max[j], pytest.approx(1.2))
 
 
 def test_who_stopped_or_fell_did_not_make_it(demo_plan, demo_rollout, figures):

@@ -40,7 +40,8 @@ class InputError(ClamberError):
         """Compose the sentence."""
         self.expected, self.source = expected, source
         self.field, self.value = field, value
-        where = ": ".join(str(x) for x in (source, field) if x is not None)
+        names = (str(x) for x in (source, field) if x is not None)
+        where = ": ".join(x if x.isprintable() else repr(x) for x in names)
         what = ":" if value is None else f" is {value!r};"
         sentence = f"{where}{what} expected {expected}" if where else expected
         super().__init__(sentence)

@@ -50,7 +50,6 @@ from clamber.cli.output import (
     replanned_record,
     skipped_tables,
 )
-from clamber.cli.progress import Report
 from clamber.cli.tools import (
     ExportCommand,
     RenderCommand,
@@ -61,6 +60,7 @@ from clamber.cli.tools import (
     ViewCommand,
 )
 from clamber.errors import ClamberError, InputError
+from clamber.model.progress import Progress
 from clamber.show.track import DRAWING, EXECUTION, PLANNING, Track
 
 
@@ -79,7 +79,7 @@ class ClimbCommand:
     """How far to look for contacts beyond the demonstrated ones."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: Switch = False
-    """Draw a video too, not pictures alone."""
+    """Draw pictures and a video."""
     out: Place = None
     """The run folder (runs/climb, then runs/climb-2 ...)."""
     output: Printed
@@ -91,8 +91,9 @@ class ClimbCommand:
             None if self.contacts == "demonstrated" else self.search.read(self.planning)
         )
         clock = Clock()
-        track = Track("detect", *PLANNING, *EXECUTION, *_drawing(self.video))
-        with self.output.progress(track, more=True) as show:
+        drawn = DRAWING if self.video else ()
+        track = Track("detect", *PLANNING, *EXECUTION, *drawn)
+        with self.output.progress(track, more=self.video) as show:
             report = clock.watching(show)
             report("detect", 0.0, "")
             demo = self.recorded.load(self.demo, None)
@@ -108,9 +109,10 @@ class ClimbCommand:
         usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
         self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
         self.output.warn(*scene.notes)
-        code = conclude(self.output, folder, plan, done, clock)
-        shown = {"demonstration": (demo, sequence), "with_video": self.video}
-        _draw(self.output, folder, clock, track, **shown)
+        code = conclude(self.output, folder, plan, done, clock, drawn=self.video)
+        if self.video:
+            _draw(self.output, folder, clock, track, demonstration=(demo, sequence))
+        _save_timings(folder, clock)
         return code
 
 
@@ -319,7 +321,7 @@ class TraverseCommand:
     """Contact changes at most."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     video: Switch = False
-    """Draw a video too, not pictures alone."""
+    """Draw pictures and a video."""
     out: Place = None
     """The run folder (runs/traverse, then runs/traverse-2 ...)."""
     output: Printed
@@ -337,8 +339,8 @@ class TraverseCommand:
         budget = self.planning.bound()
         clock = Clock()
         world = WorldFlags(robot=self.robot, scene=self.scene)
-        track = Track(*PLANNING, *EXECUTION, *_drawing(self.video))
-        with self.output.progress(track, more=True) as show:
+        track = Track(*PLANNING, *EXECUTION, *(DRAWING if self.video else ()))
+        with self.output.progress(track, more=self.video) as show:
             report = clock.watching(show)
             with world.blamed():
                 plan = clamber.plan(
@@ -357,8 +359,10 @@ class TraverseCommand:
                 done = None
                 if plan.complete:
                     done = self.execution.simulate(plan, folder, report, None)
-        code = conclude(self.output, folder, plan, done, clock)
-        _draw(self.output, folder, clock, track, with_video=self.video)
+        code = conclude(self.output, folder, plan, done, clock, drawn=self.video)
+        if self.video:
+            _draw(self.output, folder, clock, track)
+        _save_timings(folder, clock)
         return code
 
 
@@ -466,17 +470,13 @@ COMMANDS = {
 }
 
 
-def _drawing(video: bool) -> tuple[str, ...]:
-    return DRAWING if video else DRAWING[:1]
-
-
 def _plan(
     sequence: clamber.ContactSequence,
     robot: clamber.Robot,
     scene: clamber.Scene,
     flags: PlanningFlags,
     folder: Path,
-    report: Report,
+    report: Progress,
     others: Mapping[str, Any] | None = None,
 ) -> clamber.Plan:
     """Plan and save; `others`: how alternative contacts are searched for."""
@@ -502,7 +502,7 @@ def _draw(
     track: Track,
     **options: Any,
 ) -> None:
-    """Pictures, after the verdict has been shown."""
+    """Pictures and video, after the verdict has been shown."""
     missing, files = (), []
     with output.progress(track) as show, filling(folder):
         report = clock.watching(show)
@@ -510,7 +510,6 @@ def _draw(
             files = clamber.render_run(folder, report=report, **options)
         except ClamberError as e:  # the climb is as it is all the same
             missing = (str(e),)
-        _save_timings(folder, clock)
     output.warn(*missing)
     if files:
         page = f"`clamber report {folder}` makes a page of it"

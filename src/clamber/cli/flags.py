@@ -15,11 +15,11 @@ import tyro
 import clamber
 from clamber.cli.output import (
     Output,
-    Report,
     Switch,
 )
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
+from clamber.model.progress import Progress
 
 DEFAULT_HEIGHT = 0.275  # [m] of the box where no scene is given
 
@@ -209,7 +209,7 @@ class ExecutionFlags:
     """What the planner does not know of the true world."""
 
     def simulate(
-        self, plan: clamber.Plan, folder: Path, report: Report, truth: Path | None
+        self, plan: clamber.Plan, folder: Path, report: Progress, truth: Path | None
     ) -> tuple[clamber.Rollout, clamber.Verdict] | None:
         """Simulate, judge and save; None where there is nothing to simulate."""
         if plan.trajectory is None:

@@ -21,8 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 import clamber
-from clamber.cli.progress import Report, bar, lines
+from clamber.cli.progress import bar, lines
 from clamber.execution.events import event_fields
+from clamber.model.progress import Progress
 from clamber.show.track import Track
 
 REACHED, MISSED, BAD_INPUT, INTERRUPTED, READER_GONE = 0, 1, 2, 130, 141
@@ -42,7 +43,7 @@ class Output:
     """No progress, no table: files and exit code only."""
 
     @contextlib.contextmanager
-    def progress(self, track: Track, *, more: bool = False) -> Iterator[Report]:
+    def progress(self, track: Track, *, more: bool = False) -> Iterator[Progress]:
         """Yield `report(stage, share done, note)`; it draws on stderr.
 
         Args:
@@ -119,9 +120,9 @@ class Clock:
     def __init__(self) -> None:
         """Nothing has run yet."""
         self._stages: dict[str, float] = {}
-        self._moves: list[tuple[str, float]] = []
+        self._moves: dict[str, float] = {}
 
-    def watching(self, report: Report) -> Report:
+    def watching(self, report: Progress) -> Progress:
         """A report that also takes the time."""
         began: dict[tuple[str, float, str], float] = {}
         last: tuple[str, float, str] | None = None
@@ -133,20 +134,15 @@ class Clock:
                 spent = now - began[last]
                 self._stages[last[0]] = self._stages.get(last[0], 0.0) + spent
                 if last[0] == "plan":
-                    self._add(last, spent)
+                    # One that is tried again, for a later one's sake or with
+                    # other weights, costs all of that.
+                    move = last[2].rpartition(": ")[2]
+                    self._moves[move] = self._moves.get(move, 0.0) + spent
             last = (stage, done, note)
             began[last] = now
             report(stage, done, note)
 
         return timed
-
-    def _add(self, step: tuple[str, float, str], spent: float) -> None:
-        """A contact change that is tried again costs both times."""
-        for i, (note, seconds) in enumerate(self._moves):
-            if note == step[2]:
-                self._moves[i] = (note, seconds + spent)
-                return
-        self._moves.append((step[2], spent))
 
     def stages(self) -> dict[str, float]:
         """Seconds by stage."""
@@ -154,7 +150,7 @@ class Clock:
 
     def of(self, move: object) -> float | None:
         """Seconds that a contact change took; None where it was not watched."""
-        return dict(self._moves).get(str(move))
+        return self._moves.get(str(move))
 
 
 def new_table(*columns: str, numbers: bool = False) -> Table:
@@ -304,12 +300,25 @@ def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
     return [options, pelvis]
 
 
+def _strained(rollout: clamber.Rollout) -> str:
+    """Which joint may be too weak; empty where none was at its limit."""
+    from clamber.execution.verdict import strained_joint
+
+    found = strained_joint(rollout)
+    if found is None:
+        return ""
+    name, limit, seconds = found
+    return f"; {name} was at its effort limit of {limit:g} N m for {seconds:.1f} s"
+
+
 def conclude(
     output: Output,
     folder: Path,
     plan: clamber.Plan,
     done: tuple[clamber.Rollout, clamber.Verdict] | None,
     clock: Clock | None = None,
+    *,
+    drawn: bool = True,
 ) -> int:
     """Show the verdict and where the files are; the exit code says the same."""
     table = new_table("criterion", "value", "limit", "")
@@ -339,6 +348,8 @@ def conclude(
     else:
         wrong = "" if verdict is None else verdict.failed()
         note = f"failed: not met: {wrong}" if wrong else "failed: nothing was planned"
+    if rollout is not None and not reached:
+        note += _strained(rollout)
     tables = keyframe_tables(planned) if clock is not None else []
     tables += skipped_tables(plan)
     if rollout is not None and rollout.events:
@@ -347,5 +358,8 @@ def conclude(
             felt.add_row(f"{e.time:.2f}", str(e))
         tables.append(felt)
     tables += [table] if criteria else []
-    output.show(record, *tables, note=closing(note, folder, reached, plan))
+    note = closing(note, folder, reached, plan)
+    if reached and not drawn:
+        note += f"; `clamber render {folder}` draws it"
+    output.show(record, *tables, note=note)
     return REACHED if reached else MISSED

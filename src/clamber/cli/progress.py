@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Iterator
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+from rich.progress import Progress as Bar
 
+from clamber.model.progress import Progress
 from clamber.show.track import Track
 
-Report = Callable[[str, float, str], None]
+QUIET = 5.0  # [s] without a line in a log, after which one says what is being done
 
 
 @contextlib.contextmanager
-def bar(console: Console, track: Track, *, more: bool = False) -> Iterator[Report]:
+def bar(console: Console, track: Track, *, more: bool = False) -> Iterator[Progress]:
     """A bar with stage, share and the time left, for a terminal.
 
     `more`: The command goes on after it.
@@ -26,7 +29,7 @@ def bar(console: Console, track: Track, *, more: bool = False) -> Iterator[Repor
         TextColumn("{task.fields[left]:>9}"),
         TextColumn("{task.fields[note]}", markup=False),
     )
-    with Progress(*columns, console=console, transient=more) as bars:
+    with Bar(*columns, console=console, transient=more) as bars:
         task = bars.add_task("", total=1.0, left="", note="")
         bars.update(task, completed=track.share)
         shown = [""]
@@ -50,28 +53,45 @@ def bar(console: Console, track: Track, *, more: bool = False) -> Iterator[Repor
 
 
 @contextlib.contextmanager
-def lines(console: Console, track: Track, *, more: bool = False) -> Iterator[Report]:
+def lines(console: Console, track: Track, *, more: bool = False) -> Iterator[Progress]:
     """A line for each tenth of a command and for each stage, for logs.
+
+    And for what has taken `QUIET` since the last one.
 
     `more`: The command goes on after it.
     """
-    shown: tuple[int, str] = (-1, "")
+    shown, doing, ended = (-1, ""), ("", ""), threading.Event()
+    spoke = threading.Event()
 
     def say(stage: str, note: str) -> None:
         words = [w for w in (f"{100 * track.share:3.0f} % {stage}", note) if w]
         left = f" ({track})" if str(track) else ""
         text = " ".join(words) + left
         console.print(text, markup=False, highlight=False, soft_wrap=True)
+        spoke.set()
 
     def report(stage: str, done: float, note: str) -> None:
-        nonlocal shown
+        nonlocal shown, doing
         track.update(stage, done)
-        now = (int(10 * track.share), stage)
+        doing, now = (stage, note), (int(10 * track.share), stage)
         if now != shown:
             shown = now
             say(stage, note)
 
-    yield report
+    def remind() -> None:
+        while not ended.is_set():
+            if not spoke.wait(QUIET) and doing[0]:
+                say(*doing)
+            spoke.clear()
+
+    reminder = threading.Thread(target=remind, daemon=True)
+    reminder.start()
+    try:
+        yield report
+    finally:
+        ended.set()
+        spoke.set()
+        reminder.join()
     if not more:
         track.finish()
         say("done", "")

@@ -31,8 +31,8 @@ from clamber.cli.output import (
     filling,
     new_table,
 )
-from clamber.cli.progress import Report
 from clamber.errors import ClamberError, InputError
+from clamber.model.progress import Progress
 from clamber.show.track import DRAWING, Track
 
 
@@ -93,7 +93,7 @@ class RenderCommand:
             flags = "--marks, --camera, --size, --out"
             raise InputError(f"{flags}: give --video, --sheet or --frame too")
 
-    def _draw(self, report: Report) -> list[Path]:
+    def _draw(self, report: Progress) -> list[Path]:
         if not (self.video or self.sheet or self.frame is not None):
             return clamber.render_run(self.run_folder, report=report)
         from clamber.show import film, pictures
@@ -337,31 +337,13 @@ class RobotCommand:
 
     def run(self) -> int:
         """Description to a proposal, or a robot file to what a planner sees of it."""
-        from clamber.model.robot import PROPOSED
-
-        notes: list[str] = []
-        path, out = self.model, self.out
-        if self.action == "init":
-            proposal = clamber.propose_robot(self.model, effort_from=self.effort)
-            out = out or PROPOSED / proposal.name
-            if out.exists() and (not out.is_dir() or any(out.iterdir())):
-                raise InputError("a new or empty folder", "--out", value=str(out))
-            out = clamber.new_run_folder(out, "robot")
-            clamber.save_proposal(proposal, out)
-            path, notes = str(out / "robot.yaml"), list(proposal.notes)
-        robot = clamber.load_robot(path)
-        found = clamber.check_robot(robot)
+        with self.output.progress(Track("robot")) as report:
+            robot, found, out, notes = self._look(report)
         table = new_table("limb", "from", "over", "to", "surfaces", "length [m]")
         for limb in robot.limbs.values():
             chain = (limb.name, limb.root, limb.middle, limb.end)
             length = f"{found.lengths[limb.name]:.3f}"
             table.add_row(*chain, ", ".join(limb.surfaces), length)
-        if out is not None:
-            try:
-                out.mkdir(parents=True, exist_ok=True)
-                clamber.draw_robot(robot, out / "robot.png")
-            except ClamberError as e:  # the robot is checked all the same
-                notes.append(str(e))
         record = {
             "out": None if out is None else str(out),
             "name": robot.name,
@@ -386,6 +368,36 @@ class RobotCommand:
             lines.append(f"the files are in {out}: look at robot.png")
         self.output.show(record, table, note="\n".join(lines))
         return MISSED if found.faults else REACHED
+
+    def _look(
+        self, report: Progress
+    ) -> tuple[clamber.Robot, clamber.Checkup, Path | None, list[str]]:
+        """The robot, what is found of it, where its files are, and what was noted."""
+        from clamber.model.robot import PROPOSED
+
+        notes: list[str] = []
+        path, out = self.model, self.out
+        if self.action == "init":
+            proposal = clamber.propose_robot(
+                self.model, effort_from=self.effort, progress=report
+            )
+            out = out or PROPOSED / proposal.name
+            if out.exists() and (not out.is_dir() or any(out.iterdir())):
+                raise InputError("a new or empty folder", "--out", value=str(out))
+            out = clamber.new_run_folder(out, "robot")
+            clamber.save_proposal(proposal, out)
+            path, notes = str(out / "robot.yaml"), list(proposal.notes)
+        report("robot", 0.7, "checking it")
+        robot = clamber.load_robot(path)
+        found = clamber.check_robot(robot)
+        if out is not None:
+            report("robot", 0.8, "drawing it")
+            try:
+                out.mkdir(parents=True, exist_ok=True)
+                clamber.draw_robot(robot, out / "robot.png")
+            except ClamberError as e:  # the robot is checked all the same
+                notes.append(str(e))
+        return robot, found, out, notes
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -45,11 +45,12 @@ from clamber.execution.events import (
     Unintended,
 )
 from clamber.execution.probe import REACH, guarded_move
-from clamber.execution.progress import Progress, Span, nearest_keyframe
+from clamber.execution.progress import AtHand, Span, nearest_keyframe
 from clamber.execution.reference import Actions, Reference
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import joint_servo, self_positioning
 from clamber.execution.unintended import Watch
+from clamber.model.progress import Progress, silent
 from clamber.model.scene import Scene
 from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, limb_links
@@ -144,10 +145,17 @@ class Executive:
         stopped: Why it stopped; empty where it did not.
     """
 
-    def __init__(self, plan: Plan, world: World) -> None:
-        """Follow `plan` on the servos of `world`, which is not looked at otherwise."""
+    def __init__(self, plan: Plan, world: World, progress: Progress = silent) -> None:
+        """Follow `plan` on the servos of `world`, which is not looked at otherwise.
+
+        Args:
+            plan: What to do.
+            world: In which it is done.
+            progress: Called with stage, share and note where it plans again.
+        """
         assert plan.trajectory is not None
         self._plan = plan
+        self._report = progress
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
         speed = plan.options.speed
         self._slow = speed != "max" and speed <= SLOW
@@ -304,7 +312,7 @@ class Executive:
         """What was planned ahead of a policy has been done: the next steps of it."""
         key = self._at_hand.keyframes[-1]
         scene, clearance = self.estimate.world.scene, self.watch.clearance
-        found = _rest(self._plan, scene, key, 0.0, clearance)
+        found = _rest(self._plan, scene, key, 0.0, clearance, self._report)
         if found.trajectory is None:
             self._at_hand.goes_on = False
             if found.failures:
@@ -336,7 +344,7 @@ class Executive:
             return
         self._note(StartsElsewhere, distance=away, yaw=yaw)
         scene = replace(world.scene, start=np.array([*xy, theta + yaw]))
-        found = _rest(self._plan, scene, None, off, NO_EXTRA)
+        found = _rest(self._plan, scene, None, off, NO_EXTRA, self._report)
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
@@ -500,7 +508,8 @@ class Executive:
             done=self.done,
         )
         scene = estimate.scene(self._plan.world.scene)
-        found = _rest(self._plan, scene, now, off, self.watch.clearance)
+        clearance = self.watch.clearance
+        found = _rest(self._plan, scene, now, off, clearance, self._report)
         yield from self._ref.rest(THINKING if off < FALLBACK else SEARCHING)
         yield from self._follow(found, off)
 
@@ -545,7 +554,7 @@ class Executive:
     def _adopt(self, plan: Plan, trajectory: Trajectory, sample: int) -> None:
         self.estimate.believe(plan.world)
         self._ref.follow(trajectory, sample)
-        self._at_hand = Progress(plan, trajectory)
+        self._at_hand = AtHand(plan, trajectory)
         self._bearing: list[Contact] = []  # contacts that are closed
         self._closed: tuple[int, bytes] | None = None  # when, and of which surfaces
 
@@ -618,6 +627,7 @@ def _rest(
     start: State | Keyframe | None,
     off: float,
     clearance: ExtraClearance,
+    report: Progress,
 ) -> Plan:
     """What is left to do of a plan, in the scene as it is believed to be.
 
@@ -634,6 +644,9 @@ def _rest(
             contacts="any" if off >= FALLBACK else "demonstrated",
             budget=Budget(ahead=HORIZON),
             clearance=clearance,
+            progress=lambda stage, done, note: report(
+                stage, done, f"planning again: {note}"
+            ),
         )
     except InputError as e:
         failure = Failure(status=Status.UNREACHABLE, detail=str(e))

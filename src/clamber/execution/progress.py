@@ -28,8 +28,8 @@ class Span:
     __repr__ = short_repr
 
 
-class Progress:
-    """How far a plan has come.
+class AtHand:
+    """The plan at hand, and how far it has come.
 
     Attributes:
         plan: Its `keyframes` are those before, between and after the changes.

@@ -6,7 +6,6 @@ every step, so that plain MuJoCo arrives at the same states from the first one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -22,11 +21,12 @@ from clamber.execution.reference import STEPS
 from clamber.execution.sensors import BLOCK, Sensors
 from clamber.execution.servo import ControlMode, driven_world
 from clamber.model.arguments import checks_types
+from clamber.model.progress import Progress, silent
 from clamber.model.records import short_repr
 from clamber.model.shown import Viewed
 from clamber.model.terrain import SceneLike, load_scene
 from clamber.model.world import PHYSICS_STEP, World
-from clamber.planning.records import Plan, silent
+from clamber.planning.records import Plan
 from clamber.planning.trajectory import Trajectory
 
 STRIDE = 10  # physics steps between two recorded states
@@ -104,7 +104,7 @@ def simulate(
     controller: ControlMode = DEFAULT_CONTROLLER,
     disturbance: Disturbance | None = None,
     true_scene: SceneLike | None = None,
-    progress: Callable[[str, float, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> Rollout:
     """Run the trajectory of a plan in MuJoCo.
 
@@ -132,11 +132,16 @@ def simulate(
         )
     truth = None if true_scene is None else load_scene(true_scene)
     world = driven_world(perturbed_world(plan.world, d, truth), controller)
-    follower = (OpenLoop if controller == "pid" else Executive)(plan, world)
+    share, report = 0.0, progress or silent
+    if controller == "pid":
+        follower = OpenLoop(plan, world)
+    else:
+        follower = Executive(
+            plan, world, lambda _, done, note: report("simulate", share, note)
+        )
     rng = np.random.default_rng([d.seed, 1])
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)
     push = push_of(d, float(plan.trajectory.time[-1]))
-    report = progress or silent
     model = world.model
     data = mujoco.MjData(model)
     start = world.home if plan.state is None else plan.state.q

@@ -27,6 +27,7 @@ from clamber.step.stability import STANDING_SHARE, standing_share
 END_SPEED = 0.05  # [m/s] of the pelvis at the end
 TILT_TOL = np.radians(20.0)  # pelvis against the plan at the end
 HEIGHT_TOL = 0.08  # [m] pelvis against the plan at the end
+FULL = 0.999  # of its effort limit, from which on a joint is at it
 UNINTENDED_TOL = 0.01  # share of the total contact load on non-contact links
 LOAD_ON_PLAN = 0.97  # of the weight, at the end, on the contacts planned
 LOAD_ON_OBSTACLES = 0.98  # ... on obstacles, where the scene has no goal
@@ -217,6 +218,22 @@ def self_penetration(world: World, qpos: np.ndarray) -> tuple[float, str]:
 
 
 @checks_types
+def strained_joint(rollout: Rollout) -> tuple[str, float, float] | None:
+    """The joint that was at its effort limit for longest; None where none was.
+
+    Returns:
+        Its name, the limit [N m], and for how long in all [s].
+    """
+    world = rollout.world
+    order = [world.model.actuator(j).id for j in world.joints]
+    at_limit = np.abs(rollout.actuator_force[:, order]) > FULL * world.tau_max
+    times = at_limit.sum(axis=0) * rollout.stride * PHYSICS_STEP
+    j = int(np.argmax(times))
+    if times[j] == 0.0:
+        return None
+    return world.joints[j], float(world.tau_max[j]), float(times[j])
+
+
 def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdict:
     """Did the robot end where the plan says, on what it planned to rest on?
 

@@ -29,6 +29,7 @@ from clamber.model.description import (
 )
 from clamber.model.facing import said_of_ahead
 from clamber.model.limbs import Anatomy, find_limbs
+from clamber.model.progress import Progress, silent
 from clamber.model.records import short_repr
 from clamber.model.se3 import (
     quat_from_matrix,
@@ -37,6 +38,7 @@ from clamber.model.se3 import (
     rotation_vector,
 )
 from clamber.model.shapes import (
+    MAX_FRICTION,
     Shape,
     build_spec,
     link_shapes,
@@ -105,7 +107,10 @@ class Proposal:
 
 @checks_types
 def propose_robot(
-    path: str | Path, *, effort_from: str | Path | None = None
+    path: str | Path,
+    *,
+    effort_from: str | Path | None = None,
+    progress: Progress = silent,
 ) -> Proposal:
     """Propose limbs, surfaces, nominal posture, limits and gains of a description.
 
@@ -114,6 +119,7 @@ def propose_robot(
             see `clamber.model.wheels`.
         effort_from: Where effort limits are that this description lacks: another
             description with the same joint names, or a YAML mapping of joints to N m.
+        progress: Called with stage, share and note.
 
     Raises:
         InputError: It cannot be read, or is no humanoid; see `find_limbs`.
@@ -123,14 +129,18 @@ def propose_robot(
         path, limits = _from_wheel(str(path))
         effort_from = effort_from or limits
     path = Path(path)
+    progress("robot", 0.0, f"reading {path}")
     description = read_description(path, lenient=True)
+    progress("robot", 0.2, "limbs")
     tree, found, notes = _upright(description, path)
     notes += _driven(tree, found, description.mimics, path)
+    progress("robot", 0.4, "shapes of its links")
     shapes, more = link_shapes(tree)
     notes += more
     shapes, limbs = with_surfaces(tree, found, shapes)
     known = {} if effort_from is None else _known_efforts(Path(effort_from))
     effort, guessed = _efforts(tree, found, known)
+    progress("robot", 0.5, "nominal posture")
     home = nominal_posture(tree, found, effort)
     if guessed:
         notes.append(
@@ -149,6 +159,7 @@ def propose_robot(
     if thin:
         notes.append(f"thinner, for room beside other links: {', '.join(thin)}")
     gains, drives, impedance = _gains(tree, found, effort)
+    notes += _braked(tree, found)
     bears = _hand_load(tree, found, shapes, effort)
     ankles = []
     if bears >= HAND_SHARE * float(tree.model.body_subtreemass[found.base]) * 9.81:
@@ -159,6 +170,7 @@ def propose_robot(
             f"a hand supports {bears:.0f} N across its wrist: too little for compliant"
             " (self-positioning) ankles, so they stay stiff"
         )
+    progress("robot", 0.6, "its model")
     spec, files = build_spec(name, tree, found, shapes, apart, drives)
     spec.compile()
     return Proposal(
@@ -578,6 +590,22 @@ def _two_digits(x: float) -> float:
     return float(f"{x:.2g}")
 
 
+def _braked(tree: Tree, found: Anatomy) -> list[str]:
+    """What is said where joints of the description are braked more than joints are."""
+    model, dofs = tree.model, tree.model.jnt_dofadr[list(found.moving)]
+    brakes = (
+        (model.dof_damping[dofs], MAX_DAMPING, "N m s/rad of damping"),
+        (model.dof_frictionloss[dofs], MAX_FRICTION, "N m of dry friction"),
+        (model.dof_armature[dofs], MAX_ARMATURE, "kg m^2 of armature"),
+    )
+    return [
+        f"{(values > most).sum()} joints of the description have up to"
+        f" {values.max():g} {unit}, as simulations do: {most:g} are taken"
+        for values, most, unit in brakes
+        if values.max() > most
+    ]
+
+
 def _gains(
     tree: Tree, found: Anatomy, effort: Mapping[str, float]
 ) -> tuple[dict, dict[int, tuple[float, float]], dict]:
@@ -605,10 +633,9 @@ def _gains(
             light_armature, light_damping = WEAK_ARMATURE, WEAK_DAMPING
         if armature <= 0:
             armature = _two_digits(ARMATURE * inertia * light_armature)
-            armature = min(armature, MAX_ARMATURE)
         if damping <= 0:
-            damping = min(_two_digits(DAMPING * inertia * light_damping), MAX_DAMPING)
-        drives[j] = (armature, damping)
+            damping = _two_digits(DAMPING * inertia * light_damping)
+        drives[j] = (min(armature, MAX_ARMATURE), min(damping, MAX_DAMPING))
     soft = [c.elbow for c in found.limbs.values()]
     soft += [j for j in found.trunk if abs(float(data.xaxis[j, 1])) < 0.7]
     compliant = rounded(kp=COMPLIANT_KP * kp, kd=COMPLIANT_KD * kd)

@@ -39,6 +39,7 @@ FOREARM = 0.4  # share of the upper arm: shapes that reach less far are no forea
 LEAST_BALL, LARGEST_BALL = 0.12, 0.3  # ... radius at knee and elbow
 TOUCHING = 0.02  # [m] links two joints apart that are nearer are not kept apart
 ROOM = 0.01  # [m] around links as the robot stands
+MAX_FRICTION = 1.0  # [N m] dry friction of a joint
 THINNER = 0.2  # share of its size
 ROUNDING = 2e-5  # share of a moment of inertia that is lost where it is written
 MESH_FOLDER = "meshes"  # beside the model
@@ -383,16 +384,18 @@ def with_room(
     for name, angle in home.items():
         data.qpos[trial.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(trial, data)
-    parent, near = trial.body_parentid, []
+    parent, turns, near = trial.body_parentid, trial.body_jntnum, []
     most = {s.name: THINNER * min(s.size[: _sizes(s)]) for s in shapes}
     balls = {s.name for s in shapes if s.surface and s.kind == _SPHERE}
     links_only = {s.name for s in shapes if not s.surface}
     for a in range(trial.ngeom):
         for b in range(a + 1, trial.ngeom):
             i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
-            if i != j and parent[j] != i:
+            if i != j and (parent[j] != i or turns[j] > 2):
                 d = mujoco.mj_geomDistance(trial, data, a, b, 1.0, None)
-                two = parent[parent[j]] == i or parent[i] == parent[j]
+                beside = parent[i] == parent[j]
+                joints = turns[j] + turns[i if beside else int(parent[j])]
+                two = joints <= 2 and (beside or parent[parent[j]] == i)
                 links = trial.body(i).name, trial.body(j).name
                 names = trial.geom(a).name, trial.geom(b).name
                 gives = [n for n in names if n in links_only]
@@ -532,7 +535,9 @@ def _add_joint(
         axis=model.jnt_axis[joint],
         armature=armature,
         damping=[damping, 0, 0],
-        frictionloss=model.dof_frictionloss[model.jnt_dofadr[joint]],
+        frictionloss=min(
+            float(model.dof_frictionloss[model.jnt_dofadr[joint]]), MAX_FRICTION
+        ),
     )
     if model.jnt_limited[joint]:
         added.range = model.jnt_range[joint]

@@ -267,7 +267,14 @@ def load_scene(path: SceneLike) -> Scene:
             raise boxes from None
     drawn = suffix in (*MESHES, *CLOUDS)
     content = {"meshes": [shape]} if drawn else read_yaml(path)
-    return validated(SceneFile, content, path).scene(path.parent)
+    file = validated(SceneFile, content, path)
+    try:
+        return file.scene(path.parent)
+    except InputError as e:
+        if drawn or not isinstance(file.boxes, str):
+            raise
+        source = path if e.source is None else f"{path}, {e.source}"
+        raise InputError(e.expected, source, e.field, e.value) from e
 
 
 def _name_of(path: Path) -> str:

@@ -528,7 +528,11 @@ def _leg_joints(
 
 
 def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
-    """Geom pairs whose contacts MuJoCo would compute and that are apart at home."""
+    """Geom pairs that can meet and are apart at home.
+
+    Those whose contacts MuJoCo would compute, and links on more than two joints in one
+    place, such as a trunk that bends and turns on its pelvis.
+    """
     body = model.geom_bodyid
     robot = model.body_rootid[body] == model.body_rootid[base]
     weld = model.body_weldid[body]
@@ -540,7 +544,8 @@ def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
     own = robot[a] & robot[b]
     excluded = np.concatenate([model.exclude_signature, [-1]])
     low, high = np.minimum(body[a], body[b]), np.maximum(body[a], body[b])
-    joined = (weld[b] == parent[a]) | (weld[a] == parent[b])
+    few = model.body_jntnum[weld] <= 2
+    joined = (few[b] & (parent[b] == weld[a])) | (few[a] & (parent[a] == weld[b]))
     joined |= np.isin((low << 16) + high, excluded)
     joined |= np.isin((high << 16) + low, excluded)
     keep &= ~(own & joined)

@@ -141,16 +141,18 @@ class _Line:
 
     def _next(self, search: Search) -> _Line:
         """The line after its next step, or before one that is to be mended."""
-        step = self.steps[self.k]
-        names = (*(() if self.proposer == "demonstrated" else (self.proposer,)), step)
-        note = ": ".join(map(str, names))
-        search.report("plan", self.k / len(self.steps), note)
-        found = self._change(search, self.route.end, step)
+        found = self._change(search, self.route.end, self.steps[self.k])
         if isinstance(found, Change):
             return self._after(search, found)
         return self._mend(search, found)
 
     def _change(self, search: Search, before: Keyframe, step: Step) -> Change | Failure:
+        n, note = len(self.steps), str(step)
+        if search.part or self.weights:
+            note = f"step {self.k + 1} of {n}: {note}"
+        if self.weights:
+            note = f"weights {self.weights + 1} of {len(VARIATIONS)}, {note}"
+        search.report("plan", self.k / n, note)
         return search.change(self.proposer, before, step, self.options)
 
     def _after(self, search: Search, change: Change) -> _Line:

@@ -16,6 +16,7 @@ only what comes first is.
 from __future__ import annotations
 
 import math
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -104,6 +105,7 @@ class _Free:
         self.search, self.guidance, self._start = search, guidance, start
         self.seen: set[frozenset] = set()
         self.often: Counter[frozenset] = Counter()  # like steps that were tried
+        self.began = time.monotonic()
 
     def actions(self, route: Route, cost: float) -> list[_Action]:
         """All that may be done after a route."""
@@ -156,17 +158,19 @@ class _Action:
     def look(self, search: Search) -> Change | Failure:
         """Try the step."""
         assert self.step is not None  # it has not ended
+        n, tries = 1 + sum(self.free.often.values()), search.budget.tries
+        left = (time.monotonic() - self.free.began) / n * (tries - n + 1)
+        if search.left is not None:
+            left = min(left, search.left)
+        bound = f", {left:.0f} s more at this pace" if n > 1 else ""
+        note = f"step {n} of at most {tries}{bound}: {self.step}"
+        search.report("search", (n - 1) / tries, note)
         return search.change("search", self.route.end, self.step)
 
     def after(self, found: Change | Failure) -> list[_Action]:
         """What may be done after the step, where it is possible."""
         free = self.free
         free.often[self.kind] += 1
-        n, search = sum(free.often.values()), free.search
-        tries, left = search.budget.tries, search.left
-        bound = "" if left is None else f", {left:.0f} s left"
-        note = f"step {n} of at most {tries}{bound}: {self.step}"
-        search.report("search", n / tries, note)
         if isinstance(found, Failure):
             return []
         free.seen |= {self.key, _key(found.keyframe.stance)}

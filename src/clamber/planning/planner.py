@@ -24,6 +24,7 @@ from clamber.contact.scaling import retarget
 from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.model.arguments import checks_types
+from clamber.model.progress import Progress, silent
 from clamber.model.records import short_repr
 from clamber.model.robot import RobotLike, load_robot
 from clamber.model.scene import Scene
@@ -37,13 +38,11 @@ from clamber.planning.records import (
     Fallback,
     Plan,
     PlanOptions,
-    Progress,
     Route,
     Source,
     State,
     Tried,
     numbered,
-    silent,
     summary,
 )
 from clamber.planning.search import Search
@@ -271,6 +270,7 @@ class _Task:
 
     def timed(self, found: Plan) -> Plan:
         """A plan with its trajectory."""
+        self._search.part = ""
         self._search.report("trajectory", 0.0, "")
         self._clock.lap("search")
         speed = self._options.speed
@@ -383,13 +383,18 @@ class _Task:
         if first is not None and not others[0].surfaces:
             planned = [first]  # it is the only one
         else:
-            planned = self._search.each([self._job(a) for a in others])
+            jobs = [
+                self._job(a, f"alternative {k} of {len(others)}")
+                for k, a in enumerate(others, start=1)
+            ]
+            planned = self._search.each(jobs)
         for a, found in zip(others, planned, strict=True):
             yield _ranked(a.surfaces, "alternatives", found)
         if any(p.complete for p in planned):
             return
         for a in stand_ins(sequence, robot):
-            planned.append(self._job(a, 1)(self._search))
+            job = self._job(a, "elbows in place of hands", 1)
+            planned.append(job(self._search))
             yield _ranked(a.surfaces, "alternatives", planned[-1])
             if planned[-1].complete:
                 return
@@ -397,11 +402,16 @@ class _Task:
             yield from self._searched(planned)
 
     def _job(
-        self, a: Alternative, weights: int | None = None
+        self, a: Alternative, part: str, weights: int | None = None
     ) -> Callable[[Search], Plan]:
-        """Planning an alternative."""
+        """Planning an alternative, which is a part of all that is tried."""
         name = ", ".join(a.surfaces) or "demonstrated"
-        return lambda search: self._planned(search, a.sequence, name, weights)
+
+        def job(search: Search) -> Plan:
+            search.part = f"{part} ({name})"
+            return self._planned(search, a.sequence, name, weights)
+
+        return job
 
     def _searched(self, made: Sequence[Plan]) -> Iterator[Ranked]:
         """What is found from where the farthest plan is stuck, or from the start."""
@@ -412,7 +422,9 @@ class _Task:
             counts = action_counts(goal, self._ik.world)
         stuck = max(map(_before_failure, made), key=lambda x: len(x.changes))
         begin = Route(start=self._start)
-        for start in (stuck, begin) if stuck.changes else (begin,):
+        starts = (stuck, begin) if stuck.changes else (begin,)
+        for k, start in enumerate(starts, start=1):
+            self._search.part = f"other contacts, search {k} of {len(starts)}"
             route = search_contacts(self._search, start, goal, counts)
             if route.arrived:
                 found = self._searched_for(route)

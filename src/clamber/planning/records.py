@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -20,12 +20,7 @@ from clamber.step.change import Change, Failure
 from clamber.step.methods import Method
 from clamber.step.posture import Keyframe, KeyframeOptions
 
-Progress = Callable[[str, float, str], None]
 Source = Literal["alternatives", "search", "secondary"]
-
-
-def silent(stage: str, share: float, note: str) -> None:
-    """Report progress to nobody."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -21,24 +21,24 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol, Self, TypeVar
 
 from clamber.contact.steps import Step
 from clamber.errors import Status
+from clamber.model.progress import Progress, silent
 from clamber.planning.records import (
     Attempt,
     Budget,
     PlanOptions,
-    Progress,
-    silent,
 )
 from clamber.step.change import Change, Failure, change_contact
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
 
 QUEUED = 2  # entries at most that wait for a thread, for each
+SILENCE = 1.0  # [s] after which it is said what another thread is trying
 
 
 def threads() -> int:
@@ -104,8 +104,8 @@ class Search:
         ik: Workspace.
         options: How steps are planned.
         budget: How much may be tried.
-        report: Called with stage, share and note, for progress.
         attempts: All that was tried, in order.
+        part: What it is doing, of all that may be tried: said before each note.
     """
 
     def __init__(
@@ -116,9 +116,10 @@ class Search:
         report: Progress = silent,
     ) -> None:
         """Nothing has been tried; a budget of seconds counts from now on."""
-        self.ik, self.options, self.report = ik, options, report
+        self.ik, self.options = ik, options
         self.budget = budget or Budget()
         self.attempts: list[Attempt] = []
+        self.part, self._report, self._at = "", report, ("plan", 0.0)
         self._threads = threads()
         self._spare: SimpleQueue[IK] = SimpleQueue()
         seconds = self.budget.seconds
@@ -133,6 +134,15 @@ class Search:
     def late(self) -> bool:
         """Whether the budget of seconds is spent."""
         return self.left == 0.0
+
+    def report(self, stage: str, share: float, note: str) -> None:
+        """Say what is being tried."""
+        self._at = stage, share
+        self._report(stage, share, f"{self.part}: {note}" if self.part else note)
+
+    def note(self, text: str) -> None:
+        """Say what is being tried, in the stage that is reported already."""
+        self.report(*self._at, text)
 
     def change(
         self,
@@ -231,9 +241,14 @@ class _Aside:
         """
         self._search, self._job = search, job
         self._own = copy.copy(search)
-        self._own.attempts, self._own.report = [], silent
+        self._own.attempts, self._own._report = [], self._hear
         self._own._threads = workers
         self._future: Future | None = None
+        self._heard: tuple[str, float, str] | None = None
+
+    def _hear(self, *said: Any) -> None:
+        """Keep what it says until somebody waits for it."""
+        self._heard = said
 
     def begin(self, of: str) -> None:
         """Wait for a thread of a pool."""
@@ -262,8 +277,12 @@ class _Aside:
             helped = next((x for x in others if x._take()), None)
             if helped is None:
                 break
+            helped._own._report = self._search._report
             helped._future = Future()
             helped._future.set_result(helped._run())
+        while not wait([self._future], SILENCE).done:
+            if self._heard is not None:
+                self._search._report(*self._heard)
         found = self._future.result()
         self._search.attempts.extend(self._own.attempts)
         return found

@@ -137,6 +137,7 @@ class Follower:
         if proposal.posture == "home":
             reference = home_at(world, self.gait.ankles(proposal.body))
         for contact in goal.contacts[: 1 if how.first else None]:
+            self.search.note(f"{goal.option}: {contact.surface} on {contact.support}")
             if proposal.posture == "upright":
                 reference = upright_posture(ik, key, contact)
             step = Step(

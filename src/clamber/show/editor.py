@@ -17,11 +17,12 @@ from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.steps import same_place
 from clamber.execution.simulation import Rollout, simulate
 from clamber.execution.verdict import Verdict, judge
+from clamber.model.progress import Progress
 from clamber.model.records import short_repr
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning import planner
-from clamber.planning.records import Plan, Progress
+from clamber.planning.records import Plan
 from clamber.planning.substitutes import without_surfaces
 from clamber.run.folder import (
     SEQUENCE,

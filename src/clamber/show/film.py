@@ -21,9 +21,10 @@ from clamber.contact.scaling import limb_scales
 from clamber.errors import ClamberError, InputError, MissingDependency
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
+from clamber.model.progress import Progress, silent
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import World
-from clamber.planning.records import Plan, silent
+from clamber.planning.records import Plan
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.codec import whole_file
@@ -32,7 +33,6 @@ from clamber.show.renderer import (
     Camera,
     Colour,
     Preset,
-    Report,
     Shape,
     ball,
     bar,
@@ -164,7 +164,7 @@ def video(
     camera: Preset = "corner",
     marks: Marks = "none",
     skeleton: Skeleton | None = None,
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> Path:
     """Draw the rollout as a time-lapse: `video.mp4`, or `video.webp` without ffmpeg.
 
@@ -220,7 +220,7 @@ def _frames(
     camera: Preset,
     marks: Marks,
     skeleton: Skeleton | None,
-    report: Report,
+    report: Progress,
 ) -> Iterator[Image.Image]:
     """Pictures of the rollout with its clock and the move under way."""
     world, duration = rollout.world, float(rollout.time[-1])

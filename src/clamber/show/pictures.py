@@ -15,11 +15,12 @@ from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
+from clamber.model.progress import Progress, silent
 from clamber.model.robot import RobotLike
 from clamber.model.scene import GROUND, Scene
 from clamber.model.terrain import SceneLike
 from clamber.model.world import World, build_world
-from clamber.planning.records import Plan, silent
+from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
 from clamber.run.codec import whole_file
 from clamber.run.folder import (
@@ -53,7 +54,6 @@ from clamber.show.plots import (
 from clamber.show.renderer import (
     Camera,
     Preset,
-    Report,
     View,
     frame_view,
     outline,
@@ -183,7 +183,7 @@ def keyframe_sheet(
     *,
     tile: tuple[int, int] = TILE,
     camera: Preset = "corner",
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> Path:
     """Draw each keyframe with its contacts, forces and margins.
 
@@ -246,7 +246,7 @@ def climb_sheet(
     *,
     frames: int = CLIMB_FRAMES,
     tile: tuple[int, int] = (300, 250),
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> Path:
     """Draw what physics did, in pictures evenly spaced in time."""
     rows = np.linspace(0, len(rollout.time) - 1, frames).round().astype(int)
@@ -300,7 +300,7 @@ def render_run(
     *,
     with_video: bool = True,
     demonstration: tuple[Demonstration, ContactSequence] | None = None,
-    report: Report | None = None,
+    report: Progress | None = None,
 ) -> list[Path]:
     """Draw all there is to draw of a run folder, plots first.
 
@@ -325,7 +325,7 @@ def render_run(
     keyframes = float(len(plan.keyframes))
     whole = plots + keyframes + frames
 
-    def within(drawn: float, count: float) -> Report:
+    def within(drawn: float, count: float) -> Progress:
         return lambda stage, share, note: tell(
             stage, (drawn + share * count) / whole, note
         )

@@ -45,7 +45,6 @@ PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation
 }
 Colour = tuple[float, float, float, float]  # in [0, 1]
 Shape = Callable[[mujoco.MjvGeom], None]  # makes itself of a geom that is drawn
-Report = Callable[[str, float, str], None]
 MARGIN = 0.08  # share of the picture left free around what must be seen
 SEEN_POSTURES = 60  # of a motion, of which all is in the picture
 NEAR = 0.35  # [height of the motion] around it boxes are in the picture

@@ -24,6 +24,7 @@ COSTS = {
     "draw": 2.0,
     "report": 2.0,
     "sweep": 200.0,
+    "robot": 6.0,
 }
 PLANNING, EXECUTION = ("plan", "trajectory", "save"), ("simulate", "save run")
 DRAWING = ("pictures", "video")

@@ -21,7 +21,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.ik import IK
-from clamber.step.stability import limiting_joint
+from clamber.step.stability import limiting_joint, rolled_to
 from clamber.step.tasks import packed_contacts, packed_parts
 from clamber.step.transition import Transition
 
@@ -82,9 +82,7 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
         t.margin,
         adapt,
     )
-    phases = contact_phases(
-        t.stance, t.held, t.rolling, t.step.makes, postures, control
-    )
+    phases = contact_phases(ik.kin, t, postures, control)
     status, note = _verdict(ik, t, found)
     return Path(transition=t, phases=phases, status=status, note=note)
 
@@ -134,46 +132,46 @@ def _verdict(
 
 
 def contact_phases(
-    stance: tuple[Contact, ...],
-    held: tuple[Contact, ...],
-    rolling: tuple[Contact, ...],
-    made: Contact | None,
+    kin: Kinematics,
+    t: Transition,
     postures: Sequence[np.ndarray],
     arc: np.ndarray,
 ) -> tuple[Phase, Phase, Phase]:
     """The phases that change one contact: shift, swing and settle.
 
+    Each begins with the contacts where they have rolled to in the one before.
+
     Args:
-        stance: Contacts before it.
-        held: Those that stay; a foot that goes on tiptoe is on its edge here.
-        rolling: Those that are broken, as they are let go.
-        made: The new contact, if any.
+        kin: Workspace.
+        t: Whose contacts these are.
         postures: (n, nq) of each phase.
         arc: (m, 3) control points of the swing.
     """
-    after = held if made is None else (*held, made)
     shift, swing, settle = postures
+    lifted = rolled_to(kin, t.held, shift[-1])
+    landed = rolled_to(kin, lifted, swing[-1])
+    after = landed if t.step.makes is None else (*landed, t.step.makes)
     return (
         Phase(
             kind="shift",
             q=shift,
-            contacts=(*held, *rolling),
-            load_before=stance,
-            load_after=held,
+            contacts=(*t.held, *t.rolling),
+            load_before=t.stance,
+            load_after=t.held,
         ),
         Phase(
             kind="swing",
             q=swing,
-            contacts=held,
-            load_before=held,
-            load_after=held,
+            contacts=lifted,
+            load_before=lifted,
+            load_after=lifted,
             arc=arc,
         ),
         Phase(
             kind="settle",
             q=settle,
             contacts=after,
-            load_before=held,
+            load_before=landed,
             load_after=after,
         ),
     )

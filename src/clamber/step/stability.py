@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.world import World
+from clamber.model.world import World, limb_links
 from clamber.step.statics import (
     ContactPoints,
     Load,
@@ -34,6 +34,9 @@ from clamber.step.statics import (
 from clamber.step.tasks import packed_contacts
 
 EFFORT_SHARE: float = _core.EFFORT_SHARE  # of the effort limits, for holding
+MISSED = 0.001  # [m] a surface that stays as far from its support has not reached it
+STRETCHED = 0.99  # of a limb's length, from root to end
+AT_LIMIT = 0.01  # [rad] a joint that is nearer to its limit is at it
 STANDING_SHARE = 0.8  # of its height as it starts: a pelvis as high stands
 
 
@@ -159,6 +162,40 @@ def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
     )
 
 
+def out_of_reach(kin: Kinematics, q: np.ndarray, c: Contact, pair: int = -1) -> str:
+    """Why a contact cannot be made, as far as the best posture `q` (nq,) tells.
+
+    How far its surface stays from its support, whether its limb is stretched, which of
+    its joints are at a limit, and which two shapes cannot come nearer.
+
+    Args:
+        kin: Workspace.
+        q: The posture.
+        c: The contact.
+        pair: Of shapes that are as near as they may be; -1: none.
+    """
+    w = kin.world
+    kin.update(q)
+    support, limb = w.supports[c.support], w.robot.limb_of(c.surface)
+    p = kin.contact_point(c.surface, support.normal)
+    away = float(np.linalg.norm(p - support.nearest(p)))
+    said = [f"stays {1e3 * away:.0f} mm from {c.support}"] if away >= MISSED else []
+    a, b, end = (kin.landmark(x)[1] for x in (limb.root, limb.middle, limb.end))
+    length = float(np.linalg.norm(b - a) + np.linalg.norm(end - b))
+    if float(np.linalg.norm(end - a)) > STRETCHED * length:
+        said.append(f"the {limb.name.replace('_', ' ')}, {length:.2f} m, is stretched")
+    links, m = limb_links(w, c.surface), w.model
+    room = np.minimum(q[w.qadr] - w.q_min[w.dadr], w.q_max[w.dadr] - q[w.qadr])
+    mine = np.isin(m.dof_bodyid[w.dadr], list(links))
+    ends = [w.joints[i] for i in np.flatnonzero(mine & (room < AT_LIMIT))]
+    said += [f"{', '.join(ends)} at a limit"] if ends else []
+    if pair >= 0:
+        shapes = (m.geom(int(g)).name for g in w.pairs[pair])
+        said.append(f"{' and '.join(shapes)} keep their distance")
+    why = ", ".join(said)
+    return f"{Status.UNREACHABLE.value} ({c.surface}: {why})" if why else ""
+
+
 def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> float:
     """Height of the pelvis over its supports, against that over the ground at first.
 
@@ -169,8 +206,27 @@ def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> fl
     return min(over) / float(world.home[2])
 
 
+def rolled_to(
+    kin: Kinematics, contacts: Sequence[Contact], q: np.ndarray
+) -> tuple[Contact, ...]:
+    """Contacts where they have rolled to at `q` (nq,), to roll on from there.
+
+    A round surface of radius r, whose link has turned by theta since it was where the
+    contact says, touches the support r theta x n from there: exact while the link turns
+    about one axis, whatever its direction. Where several turns lead to depends on their
+    order: a contact is rolled on from each of the postures on the way.
+    """
+    if all(c.link is None for c in contacts):
+        return tuple(contacts)
+    places, links = kin.core.roll(*packed_contacts(kin.world, contacts), q)
+    return tuple(
+        c if c.link is None else replace(c, position=p, link=link)
+        for c, p, link in zip(contacts, places, links, strict=True)
+    )
+
+
 def contact_drift(kin: Kinematics, c: Contact) -> float:
     """Distance of a contact from where it should be at the present posture [m]."""
-    n = kin.world.supports[c.support].normal
-    p = kin.contact_point(c.surface, n, c.edge)
-    return float(np.linalg.norm(p - c.position - kin.roll(c.surface, n, c.link)))
+    p = kin.contact_point(c.surface, kin.world.supports[c.support].normal, c.edge)
+    (there,) = rolled_to(kin, [c], kin.data.qpos)
+    return float(np.linalg.norm(p - there.position))

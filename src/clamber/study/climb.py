@@ -23,6 +23,7 @@ from clamber.execution.servo import ControlMode
 from clamber.execution.simulation import DEFAULT_CONTROLLER, simulate
 from clamber.execution.verdict import Figure, judge
 from clamber.model.arguments import checks_types
+from clamber.model.progress import Progress, silent
 from clamber.model.records import short_repr
 from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
@@ -34,8 +35,6 @@ from clamber.planning.records import (
     Method,
     Plan,
     PlanOptions,
-    Progress,
-    silent,
 )
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo

@@ -26,9 +26,9 @@ import yaml
 
 from clamber.errors import ClamberError, InputError, MissingDependency, unreadable
 from clamber.model.arguments import checks_types
+from clamber.model.progress import Progress, silent
 from clamber.model.robot import load_robot
 from clamber.model.terrain import load_scene
-from clamber.planning.records import Progress, silent
 from clamber.recording.recording import load_demo
 from clamber.run.codec import whole_file
 from clamber.study.climb import ClimbResult, command_of, run_climb
