@@ -258,7 +258,8 @@ class Reference:
         for x in t.segments:  # on tiptoe nothing but its ankle holds a foot
             if x.edges and x.begin <= later[-1] and later[0] < x.end:
                 rows = (x.begin <= later) & (later < x.end)
-                out[np.ix_(rows, [s in x.edges for s in t.surfaces])] = False
+                for s in x.edges:
+                    out[rows, t.surfaces.index(s)] = False
         return out
 
     def _blend(

@@ -172,7 +172,8 @@ def spline_through(
     tau: np.ndarray,
 ) -> Spline:
     """The spline through postures (n, nq) at path parameters (n,); see `Spline`."""
-    curve = CubicSpline(s, postures, bc_type=((1, ends[0]), (1, ends[1])))
+    clamped: Any = ((1, ends[0]), (1, ends[1]))
+    curve = CubicSpline(s, postures, bc_type=clamped)
     return Spline(curve, postures, s, ends, grid, tau)
 
 

@@ -69,7 +69,7 @@ class Course:
     stance: np.ndarray
     stances: Sequence[Sequence[Contact]]
     makes: np.ndarray
-    made: Sequence[Contact]
+    made: Sequence[Contact | None]
 
     __repr__ = short_repr
 
@@ -112,7 +112,7 @@ def fastest(
     steep, bend = (np.maximum(x, _FLAT) for x in (course.steep, course.sharp))
     x_max = np.minimum((v / steep) ** 2, QUICKNESS * v / bend)
     for i in np.flatnonzero(course.makes >= 0):
-        x_max[i] = min(x_max[i], _gentle(kin, course, i))
+        x_max[i] = min(x_max[i], _gentle(kin, course, int(i)))
     slow = min(v, SLOW)
     x_slow = np.minimum((slow / steep) ** 2, SLOWLY * slow / bend)
     return kin.core.time_law(
@@ -143,6 +143,7 @@ def largest(x: np.ndarray) -> np.ndarray:
 def _gentle(kin: Kinematics, course: Course, i: int) -> float:
     """Bound of x near a contact to be made, infinite where it is not near."""
     c = course.made[course.makes[i]]
+    assert c is not None
     n = kin.world.supports[c.support].normal
     kin.update(course.q[i])
     p = kin.contact_point(c.surface, n, c.edge)

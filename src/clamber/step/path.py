@@ -30,6 +30,9 @@ DRIFT_LIMIT: float = _core.DRIFT_LIMIT  # [m] of contacts, anywhere on the path
 OVERLAP_LIMIT: float = _core.OVERLAP_LIMIT  # [m] of links, anywhere on the path
 
 
+ROLLED = 0.003  # [m] a contact that has rolled so far is where it was
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Phase:
     """Postures in order while the same contacts are closed.
@@ -204,9 +207,13 @@ def straightened(ik: IK, settle: Phase, shift: Phase) -> tuple[Phase, Phase] | N
         None where the stance is another one, or that way cannot be gone.
     """
     contacts = settle.contacts
-    if {(c.surface, c.edge) for c in contacts} != {
-        (c.surface, c.edge) for c in shift.contacts
-    }:
+    later = {(c.surface, c.edge): c.position for c in shift.contacts}
+    if {(c.surface, c.edge) for c in contacts} != later.keys():
+        return None
+    # What has rolled on the way by the keyframe would end elsewhere: turns do not commute.
+    if any(
+        np.linalg.norm(later[c.surface, c.edge] - c.position) > ROLLED for c in contacts
+    ):
         return None
     q = bridge(ik, settle.q[0], shift.q[-1], contacts)
     parts = packed_parts(ik.world, contacts, (), None)
@@ -214,7 +221,7 @@ def straightened(ik: IK, settle: Phase, shift: Phase) -> tuple[Phase, Phase] | N
     if status:  # what is wrong with it
         return None
     if len(q) == 2:
-        q = np.stack([q[0], interpolate(ik.kin, *q, 0.5), q[1]])
+        q = np.stack([q[0], interpolate(ik.kin, q[0], q[1], 0.5), q[1]])
     half = len(q) // 2
     return replace(settle, q=q[: half + 1]), replace(shift, q=q[half:])
 
