@@ -287,11 +287,11 @@ def test_standing_upright_nothing_overlaps(demo_plan, ik):
 
 @pytest.fixture(scope="module")
 def high_plan(demo_sequence, coman):
-    return plan(demo_sequence, coman, Scene.from_height(0.58))
+    return plan(demo_sequence, coman, Scene.from_height(0.52))
 
 
 def test_contacts_are_where_they_roll_to_along_the_whole_plan(high_plan):
-    """From posture to posture; as if each rolled about one axis it was 30 mm off."""
+    """From posture to posture; as if each rolled about one axis it was 43 mm off."""
     world, kin, rolled = high_plan.world, Kinematics(high_plan.world), {}
     worst, turns = 0.0, 0
     for phase in (p for change in high_plan.changes for p in change.phases):
@@ -307,7 +307,7 @@ def test_contacts_are_where_they_roll_to_along_the_whole_plan(high_plan):
             p = kin.contact_point(c.surface, world.supports[c.support].normal)
             worst, turns = max(worst, float(np.linalg.norm(p - c.position))), turns + 1
     assert turns > 20
-    assert worst < 0.008
+    assert worst < 0.015
 
 
 def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(high_plan):

@@ -34,7 +34,7 @@ from clamber.step.transition import (
     rolled,
 )
 
-ROLLED_TOL = 0.005  # [m] of contacts at a keyframe, against where they roll to
+ROLLED_TOL = 0.002  # [m] of contacts at a keyframe, against where they roll to
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
