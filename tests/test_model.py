@@ -1,6 +1,5 @@
 """The world against plain MuJoCo, finite differences and geometry by hand."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -8,14 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from clamber.contact.contact import Contact
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics, limb_lengths
 from clamber.model.robot import ROBOTS, load_robot
 from clamber.model.scene import GROUND, Box, Scene
 from clamber.model.se3 import matrix_from_quat, matrix_from_rpy, quat_from_matrix
 from clamber.model.world import World, _pairs, build_world, recompiled
-from clamber.step.stability import rolled_to
 
 UP = np.array([0.0, 0.0, 1.0])
 SEEDS = range(5)
@@ -708,49 +705,6 @@ def test_a_surface_on_two_bodies_is_refused(write_robot):
 # Rolling.
 
 
-def touching(kin, name, support=GROUND):
-    """A contact of a surface as its link is now, at the origin."""
-    link = quat_from_matrix(kin.rotation(kin.world.surfaces[name].body))
-    return Contact(
-        surface=name,
-        support=support,
-        position=np.zeros(3),
-        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
-        link=link,
-    )
-
-
-def turned(world, R):
-    """(nq,) the home posture, all of it turned by R (3, 3)."""
-    q = world.home.copy()
-    q[3:7] = quat_from_matrix(R @ matrix_from_quat(world.home[3:7]))
-    return q
-
-
-def without_slip(turns, normal, radius, n=2000):
-    """(3,) where a ball gets, and (3, 3) how it lies: the point that touches rests.
-
-    Integrated from velocities while it turns by vectors (3,), one after the other.
-    """
-    centre, R = np.zeros(3), np.eye(3)
-    for turn in turns:
-        for _ in range(n):
-            centre += np.cross(turn / n, radius * normal)  # v = omega x r
-        R = Rotation.from_rotvec(turn).as_matrix() @ R
-    return centre, R
-
-
-@pytest.fixture(scope="module")
-def sloping() -> World:
-    box = Box(
-        name="box",
-        size=np.array([1.0, 1.0, 0.3]),
-        position=np.array([1.0, 0.0, 0.1]),
-        rotation=matrix_from_rpy([0.2, -0.3, 0.0]),
-    )
-    return build_world(load_robot("coman"), Scene(boxes=(box,), start=np.zeros(3)))
-
-
 @pytest.mark.parametrize(("name", "radius"), [("LKnee", 0.06), ("RHand", 0.02)])
 @pytest.mark.parametrize("theta", [-1.2, 0.1, 0.8, 2.5])
 def test_a_ball_rolls_by_radius_times_angle_and_the_way_it_turns(
@@ -759,51 +713,57 @@ def test_a_ball_rolls_by_radius_times_angle_and_the_way_it_turns(
     """A wheel on the ground that turns about +y rolls towards +x."""
     kin = Kinematics(world)
     kin.update(world.home)
-    q = turned(world, matrix_from_rpy([0.0, theta, 0.0]))
-    (there,) = rolled_to(kin, [touching(kin, name)], q)
-    np.testing.assert_allclose(there.position, [radius * theta, 0.0, 0.0], atol=1e-9)
+    body = world.surfaces[name].body
+    link = quat_from_matrix(kin.rotation(body))
+    q = world.home.copy()
+    turn = np.array([np.cos(theta / 2), 0.0, np.sin(theta / 2), 0.0])
+    mujoco.mju_mulQuat(q[3:7], turn, world.home[3:7])
+    kin.update(q)
+    np.testing.assert_allclose(
+        kin.roll(name, UP, link), [radius * theta, 0.0, 0.0], atol=1e-9
+    )
 
 
-@pytest.mark.parametrize(
-    "turns",
-    [
-        [[0.3, 0.8, 0.1]],
-        [[0.0, 0.9, 0.0], [0.0, 0.0, 1.1]],
-        [[0.0, 0.0, -0.8], [0.7, 0.0, 0.0], [0.0, 0.6, 0.5], [-0.7, 0.0, 0.0]],
-    ],
-)
-def test_rolling_is_what_a_ball_does_without_slipping(sloping, turns):
-    """About the vertical, too: from posture to posture, though not from the first."""
-    kin = Kinematics(sloping)
-    kin.update(sloping.home)
-    first = there = touching(kin, "LKnee", "box")
-    normal, turns = sloping.supports["box"].normal, np.array(turns)
-    for k in range(len(turns)):
-        centre, R = without_slip(turns[: k + 1], normal, 0.06)
-        q = turned(sloping, R)
-        (there,) = rolled_to(kin, [there], q)
-        np.testing.assert_allclose(there.position, centre, atol=1e-9)
-        kin.update(q)
-        link = matrix_from_quat(there.link)
-        body = sloping.surfaces["LKnee"].body
-        np.testing.assert_allclose(link, kin.rotation(body), atol=1e-12)
-    assert there.position @ normal == pytest.approx(0.0, abs=1e-12)
-    (at_once,) = rolled_to(kin, [first], q)
-    off = np.linalg.norm(at_once.position - there.position)
-    assert (off > 5e-3) == (len(turns) > 1)
+def test_rolling_is_what_a_ball_does_without_slipping(world):
+    """Integrated from velocities: the material point at the contact is at rest."""
+    kin = Kinematics(world)
+    kin.update(world.home)
+    s = world.surfaces["LKnee"]
+    link = kin.rotation(s.body).copy()
+    normal = matrix_from_rpy([0.2, -0.3, 0.0])[:, 2]
+    axis = np.array([0.3, 0.8, 0.1])
+    axis -= normal * (axis @ normal)  # a turn about the normal rolls nowhere
+    axis /= np.linalg.norm(axis)
+    theta, n = 0.9, 2000
+    centre, R = np.zeros(3), np.eye(3)
+    for _ in range(n):
+        omega = axis * theta / n
+        centre += np.cross(
+            omega, s.radius * normal
+        )  # v = omega x r, r from the contact
+        R = Rotation.from_rotvec(omega).as_matrix() @ R
+    q = world.home.copy()
+    q[3:7] = quat_from_matrix(R @ matrix_from_quat(world.home[3:7]))
+    kin.update(q)
+    moved = kin.roll("LKnee", normal, quat_from_matrix(link))
+    np.testing.assert_allclose(moved, centre, atol=1e-9)
+    assert moved @ normal == pytest.approx(0.0, abs=1e-12)
 
 
 def test_turning_on_the_spot_rolls_nowhere_and_flat_surfaces_never_roll(kin):
     world = kin.world
-    kin.update(world.home)
-    contacts = [touching(kin, n) for n in world.surfaces]
-    q = turned(world, matrix_from_rpy([0.0, 0.0, 0.8]))
-    for there in rolled_to(kin, contacts, q):
-        np.testing.assert_allclose(there.position, 0.0, atol=1e-12)
-    foot = touching(kin, "LFoot")
-    for c in (foot, replace(touching(kin, "LKnee"), link=None)):
-        (there,) = rolled_to(kin, [c], random_posture(world, 0))
-        np.testing.assert_array_equal(there.position, 0.0)
+    q = world.home.copy()
+    turn = np.array([np.cos(0.4), 0.0, 0.0, np.sin(0.4)])
+    links = {
+        n: quat_from_matrix(kin.rotation(s.body)) for n, s in world.surfaces.items()
+    }
+    mujoco.mju_mulQuat(q[3:7], turn, world.home[3:7])
+    kin.update(q)
+    for name, link in links.items():
+        np.testing.assert_allclose(kin.roll(name, UP, link), 0.0, atol=1e-12)
+        np.testing.assert_array_equal(kin.roll(name, UP, None), 0.0)
+    kin.update(random_posture(world, 0))
+    np.testing.assert_array_equal(kin.roll("LFoot", UP, links["LFoot"]), 0.0)
 
 
 @pytest.mark.parametrize("hinges", [2, 3])

@@ -529,11 +529,6 @@ class Workspace:
     ) -> np.ndarray:
         """Postures from one to another with contacts closed, near the straight way."""
 
-    def roll(
-        self, contacts: np.ndarray, contact_values: np.ndarray, q: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Where contacts (n, 3) have rolled to at q, and (n, 4) their links there."""
-
     def rolled(
         self,
         contact: np.ndarray,

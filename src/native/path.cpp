@@ -22,6 +22,14 @@ constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
 constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
 constexpr double COM_WEIGHT = 0.3, ELLIPSE_WEIGHT = 2.0;
 
+// Contacts that stay closed in each phase: shift, swing, settle.
+std::array<std::vector<Contact>, 3> closed_contacts(const Transition& t) {
+    std::array<std::vector<Contact>, 3> out{t.held, t.held, t.held};
+    out[0].insert(out[0].end(), t.rolling.begin(), t.rolling.end());
+    if (t.makes) out[2].push_back(t.made);
+    return out;
+}
+
 }  // namespace
 
 double highest(const Support& s, const Vec3& p1, const Vec3& p2) {
@@ -185,32 +193,10 @@ void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& contr
     solve_node(last, reference_, q);
 }
 
-// Where a contact has rolled to depends on the way: each phase begins where the one
-// before it has ended.
-std::array<std::vector<Contact>, 3> PathPlanner::closed_contacts(const Transition& t) {
-    std::array<std::vector<Contact>, 3> out{t.held, t.held};
-    out[0].insert(out[0].end(), t.rolling.begin(), t.rolling.end());
-    roll(out[1], t.shifted.data());
-    out[2] = out[1];
-    roll(out[2], t.touching.data());
-    if (t.makes) out[2].push_back(t.made);
-    return out;
-}
-
-void PathPlanner::roll(std::vector<Contact>& contacts, const double* q) {
-    solver.kin.update(q);
-    for (Contact& c : contacts) {
-        const Surface& s = model_.surfaces[c.surface];
-        if (!c.has_link || !(s.radius > 0.0)) continue;
-        c.position += solver.kin.roll(c.surface, model_.supports[c.support].normal, c.link);
-        c.link = solver.kin.quat(s.body);
-    }
-}
-
-void PathPlanner::swing(const Transition& t, const std::vector<Contact>& held, Path& out) {
+void PathPlanner::swing(const Transition& t, Path& out) {
     out.control.clear();
     if (!t.makes) {
-        bridge(t.shifted, t.touching, held, out.phases[1]);
+        bridge(t.shifted, t.touching, t.held, out.phases[1]);
         return;
     }
     const Support& support = model_.supports[t.made.support];
@@ -221,7 +207,7 @@ void PathPlanner::swing(const Transition& t, const std::vector<Contact>& held, P
         slides = slides || (c.surface == t.made.surface && c.support == t.made.support);
     arc(p1, t.made.position, highest(support, p1, t.made.position), slides, ARC_POINTS,
         out.control);
-    ask_balance(held, {}, t.margin, 0.3);
+    ask_balance(t.held, {}, t.margin, 0.3);
     SurfaceTask reach = closed_task(model_, t.made);
     reach.kind = TaskKind::Reaching;
     reach.edge = -1;
@@ -234,7 +220,7 @@ void PathPlanner::swing(const Transition& t, const std::vector<Contact>& held, P
                           std::vector<double>& q) {
         swing_node(t, out.control, share, last, halves, q);
     };
-    fill(t.shifted, t.touching, static_cast<int>(out.control.size()), held, moving,
+    fill(t.shifted, t.touching, static_cast<int>(out.control.size()), t.held, moving,
          t.adapt, node, out.phases[1]);
 }
 
@@ -425,9 +411,7 @@ void PathPlanner::stances(Transition& t, const double* shifted_hint,
         const Vec3 p1 = solver.kin.contact_point(t.made.surface, -1,
                                                  model_.supports[t.made.support].normal);
         const Mat3 R_WB = solver.kin.rotation(model_.base);
-        std::vector<Contact> held = t.held;
-        roll(held, t.shifted.data());
-        ask_balance(held, {t.made}, t.margin, STANCE_WEIGHT);
+        ask_balance(t.held, {t.made}, t.margin, STANCE_WEIGHT);
         problem_.q_reference.resize(model_.nq);
         for (int i = 0; i < model_.nq; ++i)
             problem_.q_reference[i] = 0.5 * (t.shifted[i] + t.after[i]);
@@ -450,8 +434,8 @@ void PathPlanner::stances(Transition& t, const double* shifted_hint,
 }
 
 void PathPlanner::plan(const Transition& t, Path& out) {
+    swing(t, out);
     const auto contacts = closed_contacts(t);
-    swing(t, contacts[1], out);
     bridge(t.before, t.shifted, contacts[0], out.phases[0]);
     bridge(t.touching, t.after, contacts[2], out.phases[2]);
     check(t, out);

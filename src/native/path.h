@@ -54,8 +54,6 @@ class PathPlanner {
     // their edges. The hints are postures that solve similar problems, or none.
     void stances(Transition& t, const double* shifted_hint, const double* touching_hint,
                  Between& out);
-    // Where contacts have rolled to at `q`, to roll on from there.
-    void roll(std::vector<Contact>& contacts, const double* q);
     // A flat contact on the edge that lies farthest towards a point, others as they are.
     Contact rolled(const Contact& c, const Vec3& towards, const double* q);
     // What is wrong with the phases of a path.
@@ -83,9 +81,7 @@ class PathPlanner {
     void ask_balance(const std::vector<Contact>& loaded,
                      const std::vector<Contact>& unloaded, double margin,
                      double posture_weight);
-    // That stay closed in each phase: shift, swing, settle.
-    std::array<std::vector<Contact>, 3> closed_contacts(const Transition& t);
-    void swing(const Transition& t, const std::vector<Contact>& held, Path& out);
+    void swing(const Transition& t, Path& out);
     void swing_node(const Transition& t, const std::vector<Vec3>& control, double share,
                     const std::vector<double>& last, bool between, std::vector<double>& q);
     void solve_node(const std::vector<double>& from, const std::vector<double>& other,

@@ -544,24 +544,6 @@ void bind_posture(nb::module_& m) {
                  return stacked(out, nq);
              },
              "Postures from one to another with contacts closed, near the straight way.")
-        .def("roll",
-             [](Workspace& w, const Array2<int>& what, const Array2<>& where,
-                const Array1<>& q) {
-                 auto contacts = read_contacts(*w.model, what, where);
-                 const std::size_t n = contacts.size();
-                 std::vector<double> places(3 * n), links(4 * n);
-                 const std::lock_guard lock(w.busy);
-                 w.planner.roll(contacts, w.posture(q));
-                 for (std::size_t i = 0; i < n; ++i) {
-                     const Quat& r = contacts[i].link;
-                     write3(contacts[i].position, places.data() + 3 * i);
-                     std::copy_n(std::array{r.w, r.x, r.y, r.z}.data(), 4, links.data() + 4 * i);
-                 }
-                 return nb::make_tuple(own(std::move(places), {n, 3}),
-                                       own(std::move(links), {n, 4}));
-             },
-             "Where contacts (n, 3) have rolled to at q, and the orientations (n, 4) of their "
-             "links there.")
         .def("rolled",
              [](Workspace& w, const Array2<int>& what, const Array2<>& where,
                 const Array1<>& q, const Array1<>& towards) {
@@ -646,10 +628,6 @@ void bind_posture(nb::module_& m) {
                          const double* q = phases[k].data() + i * w.model->nq;
                          out.phases[k].emplace_back(q, q + w.model->nq);
                      }
-                 for (int k = 0; k < 2; ++k) {
-                     if (out.phases[k].empty()) throw std::invalid_argument("a phase without postures");
-                     (k ? t.touching : t.shifted) = out.phases[k].back();
-                 }
                  {
                      nb::gil_scoped_release released;
                      const std::lock_guard lock(w.busy);

@@ -23,7 +23,6 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import GROUND, Scene
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.start import measured_contact
-from clamber.step.stability import rolled_to
 
 TOUCH = 10.0  # [N] normal force that is a contact
 LOST = 1.5  # [N] a contact of the stance that carries less is lost
@@ -89,7 +88,7 @@ class Estimate:
     def deviation(self, c: Contact) -> tuple[float, float]:
         """How far a contact is from its plan, along the normal and sideways [m]."""
         n = self.world.supports[c.support].normal
-        off = self.point(c) - rolled_to(self.kin, [c], self.q)[0].position
+        off = self.point(c) - c.position - self.kin.roll(c.surface, n, c.link)
         up = float(off @ n)
         return up, float(np.linalg.norm(off - up * n))
 

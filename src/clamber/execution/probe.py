@@ -9,7 +9,6 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.world import World, limb_links
-from clamber.planning.start import measured_contact
 from clamber.planning.trajectory import Trajectory, build_trajectory
 from clamber.step.ik import IK
 from clamber.step.path import ARC_WEIGHT, Phase
@@ -43,8 +42,6 @@ def guarded_move(
     ik = IK(world)
     free = _limb_over(world, contact)
     ik.kin.update(q)
-    # Round ones have rolled since they were planned.
-    held = tuple(c if c.link is None else measured_contact(ik.kin, c) for c in held)
     points = contact_points(ik.kin, held).points[:, :2]
     room = com_margin(ik.kin.com[:2], support_polygon(points))
     if room <= 0:

@@ -54,9 +54,11 @@ class Kinematics:
         self._jacp = np.zeros((3, m.nv))
         self._jacr = np.zeros((3, m.nv))
         self._near = near_pairs(m, world.pairs)
+        self._turn = np.zeros(3)
         # Views of the data: asking for them anew at each use costs more than the use.
         self._xpos = self.data.xpos
         self._xmat = self.data.xmat.reshape(-1, 3, 3)
+        self._xquat = self.data.xquat
         self._com = self.data.subtree_com[world.base]
         self._landmarks: dict[str, tuple[int, np.ndarray]] = {}
 
@@ -133,6 +135,26 @@ class Kinematics:
         s = self.world.surface(surface, edge)
         p = self.point(s.body, s.corners)
         return p - s.radius * normal if s.radius else p
+
+    def roll(
+        self, surface: str, normal: np.ndarray, link: np.ndarray | None
+    ) -> np.ndarray:
+        """(3,) how far a round surface's contact has rolled from where its link was.
+
+        For a turn theta of the link, r theta x n: exact about one axis.
+
+        Args:
+            surface: Its name.
+            normal: (3,) of the support.
+            link: (4,) orientation of the link where the contact was taken, or None.
+        """
+        s = self.world.surfaces[surface]
+        if link is None or s.radius == 0.0:
+            return np.zeros(3)
+        mujoco.mju_subQuat(self._turn, self._xquat[s.body], link)
+        x, y, z = (s.radius * (self.rotation(s.body) @ self._turn)).tolist()
+        nx, ny, nz = normal.tolist()
+        return np.array([y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
 
     def proximity(self, reach: float, active: np.ndarray | None = None) -> Proximity:
         """Pairs nearer than `reach` [m]; `active` (P,) bool restricts them."""

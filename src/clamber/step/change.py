@@ -24,17 +24,14 @@ from clamber.step.posture import (
     finish,
     orientation_at,
 )
-from clamber.step.stability import limiting_joint, out_of_reach, rolled_to
+from clamber.step.stability import limiting_joint, out_of_reach
 from clamber.step.tasks import support_rotation
 from clamber.step.transition import (
     MARGINS,
-    Transition,
     approach_contact,
     plan_transition,
     rolled,
 )
-
-ROLLED_TOL = 0.002  # [m] of contacts at a keyframe, against where they roll to
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -191,14 +188,14 @@ def change_contact(
     for held in _footings(ik, before, step):
         found = None
         for key in _keyframes(ik, before, step, held, options, method):
-            found = _change(ik, before, key, step, options)
+            found = _change(ik, before, key, step)
             if isinstance(found, Change):
                 return found
         failure = failure or found
     if step.turns and step.makes is not None:
         for held in _footings(ik, before, step):
             key = _keyframe_turned(ik, before, step, held, options)
-            found = _change(ik, before, replace(key, method=method), step, options)
+            found = _change(ik, before, replace(key, method=method), step)
             if isinstance(found, Change):
                 return found
     if failure is None:
@@ -244,9 +241,7 @@ def _keyframes(
         wanted = next(c for c in key.stance if c.surface == wanted.surface)
 
 
-def _change(
-    ik: IK, before: Keyframe, key: Keyframe, step: Step, options: KeyframeOptions
-) -> Change | Failure:
+def _change(ik: IK, before: Keyframe, key: Keyframe, step: Step) -> Change | Failure:
     """The way to a keyframe with the largest of `MARGINS` for which there is one."""
     if key.status is not Status.SOLVED:
         detail = ""
@@ -262,51 +257,16 @@ def _change(
         status, detail = transition.status, transition.note
         if status is not Status.SOLVED:
             continue
-        there = _rolled_on(ik, key, transition, options)
-        status = there.status
-        if status is not Status.SOLVED:
-            continue
-        path = plan_path(ik, replace(transition, after=there.q))
+        path = plan_path(ik, transition)
         status, detail = path.status, path.note
         if status is Status.SOLVED:
             return Change(
                 step=transition.step,
-                keyframe=there,
+                keyframe=key,
                 phases=path.phases,
                 margin=margin,
             )
     return Failure(status=status, step=step, detail=detail)
-
-
-def _rolled_on(
-    ik: IK, key: Keyframe, t: Transition, options: KeyframeOptions
-) -> Keyframe:
-    """The keyframe, its contacts where they have rolled to on the way to it.
-
-    It was found as if they rolled straight there. Where a link turns first one way and
-    then another, its contact ends elsewhere, and the posture moves after it.
-    """
-    held = t.held
-    for q in (t.shifted, t.touching):
-        held = rolled_to(ik.kin, held, q)
-    places = {c.surface: c.position for c in key.stance}
-    off = [
-        np.linalg.norm(c.position - places[c.surface])
-        for c in rolled_to(ik.kin, held, key.q)
-        if c.link is not None
-    ]
-    if max(off, default=0.0) <= ROLLED_TOL:
-        return key
-    made = () if t.step.makes is None else (t.step.makes,)
-    task = KeyframeTask(held=(*held, *made), new=(), q_reference=key.q)
-    found = direct(ik, task, key.q, options)
-    return replace(
-        found,
-        method=key.method,
-        iterations=key.iterations + found.iterations,
-        cost_before=key.cost_before,
-        cost_after=key.cost_after,
-    )
 
 
 def _task(

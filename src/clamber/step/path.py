@@ -21,16 +21,13 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
 from clamber.model.world import World
 from clamber.step.ik import IK
-from clamber.step.stability import limiting_joint, rolled_to
+from clamber.step.stability import limiting_joint
 from clamber.step.tasks import packed_contacts, packed_parts
 from clamber.step.transition import Transition
 
 ARC_WEIGHT: float = _core.ARC_WEIGHT  # of the arc, against posture 0.3 and constraints
 DRIFT_LIMIT: float = _core.DRIFT_LIMIT  # [m] of contacts, anywhere on the path
 OVERLAP_LIMIT: float = _core.OVERLAP_LIMIT  # [m] of links, anywhere on the path
-
-
-ROLLED = 0.003  # [m] a contact that has rolled so far is where it was
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -85,7 +82,9 @@ def plan_path(ik: IK, transition: Transition, *, adapt: bool = True) -> Path:
         t.margin,
         adapt,
     )
-    phases = contact_phases(ik.kin, t, postures, control)
+    phases = contact_phases(
+        t.stance, t.held, t.rolling, t.step.makes, postures, control
+    )
     status, note = _verdict(ik, t, found)
     return Path(transition=t, phases=phases, status=status, note=note)
 
@@ -135,46 +134,46 @@ def _verdict(
 
 
 def contact_phases(
-    kin: Kinematics,
-    t: Transition,
+    stance: tuple[Contact, ...],
+    held: tuple[Contact, ...],
+    rolling: tuple[Contact, ...],
+    made: Contact | None,
     postures: Sequence[np.ndarray],
     arc: np.ndarray,
 ) -> tuple[Phase, Phase, Phase]:
     """The phases that change one contact: shift, swing and settle.
 
-    Each begins with the contacts where they have rolled to in the one before.
-
     Args:
-        kin: Workspace.
-        t: Whose contacts these are.
+        stance: Contacts before it.
+        held: Those that stay; a foot that goes on tiptoe is on its edge here.
+        rolling: Those that are broken, as they are let go.
+        made: The new contact, if any.
         postures: (n, nq) of each phase.
         arc: (m, 3) control points of the swing.
     """
+    after = held if made is None else (*held, made)
     shift, swing, settle = postures
-    lifted = rolled_to(kin, t.held, shift[-1])
-    landed = rolled_to(kin, lifted, swing[-1])
-    after = landed if t.step.makes is None else (*landed, t.step.makes)
     return (
         Phase(
             kind="shift",
             q=shift,
-            contacts=(*t.held, *t.rolling),
-            load_before=t.stance,
-            load_after=t.held,
+            contacts=(*held, *rolling),
+            load_before=stance,
+            load_after=held,
         ),
         Phase(
             kind="swing",
             q=swing,
-            contacts=lifted,
-            load_before=lifted,
-            load_after=lifted,
+            contacts=held,
+            load_before=held,
+            load_after=held,
             arc=arc,
         ),
         Phase(
             kind="settle",
             q=settle,
             contacts=after,
-            load_before=landed,
+            load_before=held,
             load_after=after,
         ),
     )
@@ -207,13 +206,9 @@ def straightened(ik: IK, settle: Phase, shift: Phase) -> tuple[Phase, Phase] | N
         None where the stance is another one, or that way cannot be gone.
     """
     contacts = settle.contacts
-    later = {(c.surface, c.edge): c.position for c in shift.contacts}
-    if {(c.surface, c.edge) for c in contacts} != later.keys():
-        return None
-    # What has rolled on the way by the keyframe would end elsewhere: turns do not commute.
-    if any(
-        np.linalg.norm(later[c.surface, c.edge] - c.position) > ROLLED for c in contacts
-    ):
+    if {(c.surface, c.edge) for c in contacts} != {
+        (c.surface, c.edge) for c in shift.contacts
+    }:
         return None
     q = bridge(ik, settle.q[0], shift.q[-1], contacts)
     parts = packed_parts(ik.world, contacts, (), None)

@@ -30,12 +30,7 @@ from clamber.step.ik import (
     Residuals,
     contact_clearance,
 )
-from clamber.step.stability import (
-    ContactState,
-    contact_state,
-    equilibrium_at,
-    rolled_to,
-)
+from clamber.step.stability import ContactState, contact_state, equilibrium_at
 from clamber.step.statics import StaticEquilibrium
 from clamber.step.tasks import SurfaceTask, closed, sliding, support_rotation
 
@@ -212,7 +207,7 @@ def finish(
         held=(*task.held, *new), new=(), q_reference=q, directions=task.directions
     )
     residuals = ik.residuals(keyframe_problem(world, measured, options, ()), q)
-    states = tuple(contact_state(kin, c) for c in rolled_to(kin, measured.held, q))
+    states = tuple(contact_state(kin, c) for c in measured.held)
     cost_after, _ = stability_cost(kin, task, places, options.stability_weight)
     com = kin.com.copy()
     equilibrium = equilibrium_at(kin, q, measured.held)

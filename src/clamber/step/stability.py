@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -206,27 +206,8 @@ def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> fl
     return min(over) / float(world.home[2])
 
 
-def rolled_to(
-    kin: Kinematics, contacts: Sequence[Contact], q: np.ndarray
-) -> tuple[Contact, ...]:
-    """Contacts where they have rolled to at `q` (nq,), to roll on from there.
-
-    A round surface of radius r, whose link has turned by theta since it was where the
-    contact says, touches the support r theta x n from there: exact while the link turns
-    about one axis, whatever its direction. Where several turns lead to depends on their
-    order: a contact is rolled on from each of the postures on the way.
-    """
-    if all(c.link is None for c in contacts):
-        return tuple(contacts)
-    places, links = kin.core.roll(*packed_contacts(kin.world, contacts), q)
-    return tuple(
-        c if c.link is None else replace(c, position=p, link=link)
-        for c, p, link in zip(contacts, places, links, strict=True)
-    )
-
-
 def contact_drift(kin: Kinematics, c: Contact) -> float:
     """Distance of a contact from where it should be at the present posture [m]."""
-    p = kin.contact_point(c.surface, kin.world.supports[c.support].normal, c.edge)
-    (there,) = rolled_to(kin, [c], kin.data.qpos)
-    return float(np.linalg.norm(p - there.position))
+    n = kin.world.supports[c.support].normal
+    p = kin.contact_point(c.surface, n, c.edge)
+    return float(np.linalg.norm(p - c.position - kin.roll(c.surface, n, c.link)))

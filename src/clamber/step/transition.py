@@ -52,8 +52,7 @@ class Transition:
         shifted: (nq,) all old contacts closed, weight on those that stay.
         touching: (nq,) the new contact closed, not loaded.
         stance: Contacts at its start.
-        held: Contacts that stay, as they are at its start; a foot that goes on tiptoe
-            is on its edge here.
+        held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
         rolling: Contacts that are broken, as they are let go.
         margin: Of the centre of mass to the border of its polygon, throughout [m].
         status: Of the worst of its postures, with its residuals; OVERLOADED where the
@@ -160,13 +159,7 @@ def plan_transition(
     """
     world = ik.world
     new = step.makes.surface if step.makes is not None else None
-    # As they were: on the way they roll from there.
-    was = {c.surface: c for c in before.stance}
-    held = tuple(
-        was[c.surface] if c.edge is None else c
-        for c in after.stance
-        if c.surface != new
-    )
+    held = tuple(c for c in after.stance if c.surface != new)
     leaving = tuple(c for c in before.stance if c.surface in step.breaks)
     if step.makes is not None:
         made = next(c for c in after.stance if c.surface == step.makes.surface)
