@@ -80,12 +80,6 @@ def test_a_scene_names_a_drawing(tmp_path, rng):
 @pytest.mark.parametrize(
     ("name", "text", "word"),
     [
-        ("w.xml", MJCF.replace('type="box"', 'type="sphere"', 1), "boxes and a plane"),
-        (
-            "w.xml",
-            MJCF.replace('<geom type="box"', '<geom type="sphere"'),
-            r"the geom at \(2, 0, 0.2\) is 'sphere'",
-        ),
         (
             "w.xml",
             MJCF.replace('friction="0.7"', 'friction="1.5"'),
@@ -164,7 +158,7 @@ def test_a_box_of_a_urdf_or_sdf_is_where_its_poses_put_it(
 
 
 @pytest.mark.parametrize("kind", ["urdf", "sdf", "xml"])
-def test_a_mesh_that_is_no_box_is_named_with_what_can_be_done(tmp_path, kind):
+def test_a_drawn_mesh_that_is_no_box_is_a_mesh(tmp_path, kind):
     text = triangulated([1.0, 1.2, 0.2], False).replace(
         "v 0.5 0.6 0.1", "v 0.1 0.2 0.1"
     )
@@ -174,10 +168,33 @@ def test_a_mesh_that_is_no_box_is_named_with_what_can_be_done(tmp_path, kind):
         scene = """<mujoco><asset><mesh name="rock" file="m.obj"/></asset><worldbody>
           <geom type="mesh" mesh="rock"/></worldbody></mujoco>"""
     (tmp_path / f"s.{kind}").write_text(scene)
-    word = {"xml": "mesh 'rock'", "sdf": "mesh 'm.obj'", "urdf": "mesh 'm'"}[kind]
-    with pytest.raises(InputError, match=f"{word} is '8 corners'.*put boxes") as e:
-        load_scene(tmp_path / f"s.{kind}")
-    assert "\n" not in str(e.value)
+    scene = load_scene(tmp_path / f"s.{kind}")
+    (mesh,) = scene.meshes
+    assert mesh.name == {"xml": "box1", "sdf": "top", "urdf": "top"}[kind]
+    assert not scene.boxes
+    assert mesh.friction == {"xml": 1.0, "sdf": 0.6, "urdf": 0.8}[kind]
+
+
+@pytest.mark.parametrize(
+    ("geom", "top"),
+    [
+        ('type="cylinder" size="0.3 0.1" pos="0.6 0 0.1"', 0.2),
+        ('type="sphere" size="0.2" pos="0.6 0 0.2"', 0.4),
+        ('type="capsule" size="0.1 0.4" pos="0.6 0 0.1" euler="90 0 0"', 0.2),
+        ('type="ellipsoid" size="0.4 0.3 0.1" pos="0.6 0 0.1"', 0.2),
+        ('type="hfield" hfield="h" pos="0.6 0 0"', 0.3),
+    ],
+)
+def test_geoms_of_every_kind_are_terrain_as_high_as_they_are(tmp_path, geom, top):
+    (tmp_path / "s.xml").write_text(
+        f"""<mujoco><asset><hfield name="h" nrow="2" ncol="3" size="0.3 0.4 0.3 0.1"
+        elevation="0 1 0 0 1 0"/></asset><worldbody><geom {geom} friction="0.6"/>
+        </worldbody></mujoco>"""
+    )
+    (mesh,) = load_scene(tmp_path / "s.xml").meshes
+    highest = max(p[:, 2].max() for p in mesh.pieces)
+    assert highest == pytest.approx(top, abs=0.003)
+    assert mesh.friction == 0.6
 
 
 def test_a_mesh_of_an_mjcf_with_the_corners_of_a_box_is_one(tmp_path):
@@ -261,8 +278,11 @@ def test_an_obj_with_y_up_is_asked_about_and_never_half_buried(tmp_path, rng):
 def test_an_obj_of_another_shape_is_named(tmp_path):
     text = triangulated([1.0, 1.2, 0.2], False) + "v 0 0 0.4\nf 5 6 9\n"
     (tmp_path / "b.obj").write_text("o rock\n" + text)
+    (tmp_path / "s.yaml").write_text("boxes: b.obj\n")
     with pytest.raises(InputError, match=r"rock is '9 corners'.*put boxes in its"):
-        load_scene(tmp_path / "b.obj")
+        load_scene(tmp_path / "s.yaml")
+    (mesh,) = load_scene(tmp_path / "b.obj").meshes  # by itself it is a mesh
+    assert mesh.name == "b"
 
 
 def test_a_missing_drawing_is_named(tmp_path):

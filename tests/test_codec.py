@@ -23,6 +23,7 @@ from clamber.errors import InputError, Status
 from clamber.execution.events import EVENTS, Event
 from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict, judge
+from clamber.model.patches import mesh_of
 from clamber.model.robot import Limb, Robot
 from clamber.model.scene import Support
 from clamber.model.world import Surface, World
@@ -176,6 +177,9 @@ def rarer(plan: Plan) -> Iterator[Any]:
         yield kind(**{f.name: of[hints[f.name]] for f in fields(kind)})
     yield Skipped(stance=1, reason="out of reach")
     yield Iteration(option="ac1", cost=1 / 3)
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) / 3
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    yield mesh_of("rock", corners, faces, friction=1 / 3, notes=("turned round",))
 
 
 def test_every_record_of_a_file_survives_it_to_the_last_bit(examples: dict[type, Any]):

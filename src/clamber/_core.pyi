@@ -47,6 +47,18 @@ class Proximity:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Pairs (m,), distances (m,), normals, first and second points (m, 3)."""
 
+def grow_planes(
+    corners: np.ndarray,
+    normals: np.ndarray,
+    weights: np.ndarray,
+    first: np.ndarray,
+    next: np.ndarray,
+    order: np.ndarray,
+    reach: float,
+    cosine: float,
+) -> np.ndarray:
+    """(n,) int32 labels: of elements in one plane; neighbours are `next[first:...]`."""
+
 # Statics: points and normals (nc, 3), mu (nc,), edges of a pyramid, com (3,), mass;
 # torque: jacobian (3 nc, nv), gravity (nv,), dofs (na,), limits (na,) or None.
 

@@ -144,7 +144,7 @@ _KINDS: tuple[tuple[str, bytes, str, str], ...] = (
     ("", b"MATLAB 5", "a MATLAB file", _SAVE),
     ("", b"Kaydara FBX", "an FBX file", "export it as BVH or C3D"),
     ("", b"; FBX", "an FBX file", "export it as BVH or C3D"),
-    ("", b"glTF", "a glTF file", "export it as BVH, or as OBJ"),
+    ("gltf", b"glTF", "a glTF file", "export it as BVH, or as OBJ"),
     ("", b"BLENDER", "a Blender file", "export what it holds"),
     ("", b"%PDF", "a PDF", ""),
     ("", b"\x89PNG", "a picture", ""),
@@ -163,7 +163,7 @@ _KINDS: tuple[tuple[str, bytes, str, str], ...] = (
     ("xml", b"<robot", "a URDF", ""),
     ("xml", b"<mujoco", "an MJCF", ""),
     ("xml", b"<sdf", "an SDF", ""),
-    ("", b"ply\n", "a PLY mesh", "save it as OBJ or STL"),
+    ("ply", b"ply\n", "a PLY mesh", "save it as OBJ or STL"),
 )
 _START = 512  # [byte] by which a file is told
 
@@ -183,7 +183,8 @@ def check_kind(path: Path, expected: str, *own: str) -> bytes:
     Args:
         path: The file.
         expected: What is wanted, for the message: `a scene`.
-        own: Short names of kinds that will do: npz, pickle, npy, bvh, trc, csv, xml.
+        own: Short names of kinds that will do: npz, pickle, npy, bvh, trc, csv,
+            xml, ply, gltf.
 
     Returns:
         Its first bytes.

@@ -34,6 +34,7 @@ nb::ndarray<nb::numpy, T> new_array(const T* data, std::initializer_list<std::si
 void bind_polygon(nb::module_& m);
 void bind_statics(nb::module_& m);
 void bind_geometry(nb::module_& m);
+void bind_planes(nb::module_& m);
 void bind_model(nb::module_& m);
 void bind_posture(nb::module_& m);
 void bind_servo(nb::module_& m);

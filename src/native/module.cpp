@@ -8,6 +8,7 @@ NB_MODULE(_core, m) {
     clamber::bind_polygon(m);
     clamber::bind_statics(m);
     clamber::bind_geometry(m);
+    clamber::bind_planes(m);
     clamber::bind_model(m);
     clamber::bind_posture(m);
     clamber::bind_servo(m);

@@ -108,6 +108,7 @@ class ClimbCommand:
                 done = self.execution.simulate(plan, folder, report, None)
         usual = ("recognised", "unit:", "gaps", "fitted", "not fitted")
         self.output.warn(*(n for n in demo.notes if not n.startswith(usual)))
+        self.output.warn(*scene.notes)
         code = conclude(self.output, folder, plan, done, clock, drawn=self.video)
         if self.video:
             _draw(self.output, folder, clock, track, demonstration=(demo, sequence))

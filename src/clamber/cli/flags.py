@@ -124,7 +124,7 @@ class WorldFlags:
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
     ] = None
-    """A scene.yaml, or boxes as OBJ, MJCF, URDF or SDF."""
+    """A scene.yaml, boxes as OBJ, MJCF, URDF or SDF, a mesh, or a cloud of points."""
 
     def load(self) -> tuple[clamber.Robot, clamber.Scene]:
         """Robot and scene, the scene first checked as the cheaper one."""

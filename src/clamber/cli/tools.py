@@ -7,6 +7,7 @@ import re
 import socket
 import sys
 import time
+from collections import Counter
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -279,7 +280,7 @@ class SceneCommand:
     """Check a scene, say what is in it and, with --out, draw it."""
 
     file: Annotated[Path, tyro.conf.Positional, shown("FILE")]
-    """A scene.yaml, or boxes as OBJ, MJCF, URDF or SDF."""
+    """A scene.yaml, boxes as OBJ, MJCF, URDF or SDF, a mesh, or a cloud of points."""
     robot: RobotName = "coman"
     """Who stands at its start: a robot by name, or a robot.yaml."""
     out: Annotated[Path | None, shown("DIR")] = None
@@ -301,6 +302,13 @@ class SceneCommand:
             text = " ".join(f"{x:.3f}" for x in centre)
             table.add_row(s.name, text, f"{slope:.1f}", f"{s.friction:g}", fault)
         record: dict[str, Any] = {"supports": supports, "picture": None}
+        refused = [r.why for m in scene.meshes for r in m.rejected]
+        record |= {"rejected": refused, "notes": list(scene.notes)}
+        why = Counter(text.partition(":")[0] for text in refused)
+        if why:
+            parts = ", ".join(f"{text} {n}" for text, n in sorted(why.items()))
+            self.output.warn(f"flat parts that are no supports: {parts}")
+        self.output.warn(*scene.notes)
         note = ""
         if self.out is not None:
             robot = clamber.load_robot(self.robot)

@@ -18,9 +18,11 @@ import numpy as np
 from clamber.contact.contact import Contact, ContactSequence, Stance
 from clamber.errors import InputError
 from clamber.model.kinematics import Kinematics, limb_lengths
-from clamber.model.scene import GROUND
+from clamber.model.scene import GROUND, Edge, Support
 from clamber.model.se3 import matrix_from_quat, quat_from_matrix
 from clamber.model.world import World
+
+INSET = 0.03  # [m] of a contact from the border of one of several supports
 
 
 def limb_scales(subject: dict[str, float] | None, kin: Kinematics) -> dict[str, float]:
@@ -42,10 +44,13 @@ def _ground_start(sequence: ContactSequence) -> np.ndarray:
     return sequence.scene.start[:2]
 
 
-def _box_names(sequence: ContactSequence, world: World) -> dict[str, str]:
-    """Robot's box for each of the person's, in the order in which they are touched.
+def _obstacles(
+    sequence: ContactSequence, world: World
+) -> dict[str, tuple[Support, ...]]:
+    """Supports of the obstacle for each of the person's, in the order of touching them.
 
-    A robot's own plan means the boxes that it names.
+    A box has one, a mesh as many as it has. A robot's own plan means the supports that
+    it names.
     """
     touched = list(
         dict.fromkeys(
@@ -55,16 +60,39 @@ def _box_names(sequence: ContactSequence, world: World) -> dict[str, str]:
             if c.support != GROUND
         )
     )
-    boxes = [b.name for b in world.scene.boxes]
-    if sequence.subject is None and set(touched) <= set(boxes):
-        return {name: name for name in touched}  # a robot's own plan
-    if len(boxes) < len(touched):
+    scene, supports = world.scene, world.supports
+    if sequence.subject is None and set(touched) <= set(supports):
+        return {name: (supports[name],) for name in touched}  # a robot's own plan
+    found = [(b.name, (b.top,)) for b in scene.boxes]
+    found += [(m.name, m.supports) for m in scene.meshes if m.supports]
+    if len(found) < len(touched):
         raise InputError(
             f"as many boxes as the demonstration touches ({len(touched)})",
             field="scene.boxes",
-            value=boxes,
+            value=[name for name, _ in found],
         )
-    return dict(zip(touched, boxes, strict=False))
+    return dict(zip(touched, (tops for _, tops in found), strict=False))
+
+
+def _near_edge(supports: tuple[Support, ...], start: np.ndarray) -> Edge:
+    """Of those of some supports, the one that is nearest to a place (2,)."""
+    edges = [s.edge_towards(start) for s in supports]
+    return min(edges, key=lambda e: float(np.linalg.norm(e.point[:2] - start[:2])))
+
+
+def _on(supports: tuple[Support, ...], p: np.ndarray) -> Support:
+    """The highest of some supports under or over a point (3,), else the nearest."""
+    if len(supports) == 1:
+        return supports[0]
+    level = [np.array([*p[:2], s.level(p)]) for s in supports]
+    over = [
+        (x[2], i)
+        for i, (s, x) in enumerate(zip(supports, level, strict=True))
+        if s.inside(x, INSET)
+    ]
+    if over:
+        return supports[max(over)[1]]
+    return min(supports, key=lambda s: float(np.linalg.norm(s.nearest(p, INSET) - p)))
 
 
 def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
@@ -79,14 +107,14 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
     kin = Kinematics(world)
     kin.update(world.home)
     scales = limb_scales(dict(sequence.subject) if sequence.subject else None, kin)
-    names = _box_names(sequence, world)
+    obstacles = _obstacles(sequence, world)
     there_start, here_start = _ground_start(sequence), world.scene.start[:2]
     edges = {
         a: (
             sequence.scene.support(a).edge_towards(there_start),
-            world.supports[b].edge_towards(here_start),
+            _near_edge(tops, here_start),
         )
-        for a, b in names.items()
+        for a, tops in obstacles.items()
     }
     yaw = world.scene.start[2]
     if edges:
@@ -109,11 +137,12 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
             position, support = home + turn @ (scale * offset), GROUND
         else:
             there, here = edges[c.support]
-            support = names[c.support]
             x, y, _ = there.rotation.T @ (c.position - there.point)
             position = here.point + here.rotation @ np.array([scale * x, scale * y, 0])
-            s = world.supports[support]
-            position = position - s.normal * s.height(position)
+            s = _on(obstacles[c.support], position)
+            support, position = s.name, position - s.normal * s.height(position)
+            if len(obstacles[c.support]) > 1:
+                position = s.nearest(position, INSET)
         R = turn @ matrix_from_quat(c.quaternion)
         return Contact(
             surface=c.surface,

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
-from clamber.model.scene import Box, Scene
+from clamber.model.scene import Box, Mesh, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import PHYSICS_STEP, World, build_world, recompiled
 
@@ -87,9 +87,21 @@ def perturbed_scene(scene: Scene, d: Disturbance) -> Scene:
     return replace(
         scene,
         boxes=tuple(boxes),
+        meshes=tuple(_raised(m, d) for m in scene.meshes),
         ground_friction=scene.ground_friction if d.friction is None else d.friction,
         start=np.array([x + d.x, y + d.y, yaw + d.yaw]),
     )
+
+
+def _raised(mesh: Mesh, d: Disturbance) -> Mesh:
+    """A mesh with another height and friction."""
+    up = np.array([0.0, 0.0, d.height])
+    mu = mesh.friction if d.friction is None else d.friction
+    supports = (
+        replace(s, position=s.position + up, friction=mu) for s in mesh.supports
+    )
+    pieces = tuple(p + up for p in mesh.pieces)
+    return replace(mesh, pieces=pieces, supports=tuple(supports), friction=mu)
 
 
 def _upright(box: Box) -> Box:

@@ -6,6 +6,7 @@ judged alike: `measure` makes figures of it, `judge` compares them with their li
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -248,7 +249,7 @@ def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdi
     final = plan.keyframes[-1].stance
     up, up_planned = (upward(q[3:7]) for q in (last, planned))
     tilt = float(np.arccos(np.clip(up @ up_planned, -1.0, 1.0)))
-    on_plan = sum(f.end_load.get(key, 0.0) for key in rollout.rests_on)
+    on_plan = _load_on(world, f.end_load, rollout.rests_on)
     on_ground = sum(v for k, v in f.end_load.items() if k.endswith("@" + GROUND))
     criteria = {
         Figure.UPRIGHT: _at_least(float(not rollout.fell), 1.0),
@@ -281,6 +282,22 @@ def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdi
             off = float(abs(wrap(yaw_of(last[3:7]) - scene.goal[2])))
             criteria[Figure.YAW] = _at_most(off, float(YAW_TOL))
     return Verdict(reached=all(c.ok for c in criteria.values()), criteria=criteria)
+
+
+def _load_on(
+    world: World, load: Mapping[str, float], rests_on: Collection[str]
+) -> float:
+    """The share of the weight on contacts `surface@support`.
+
+    A surface that is on a support of a mesh rests on the parts beside it as well.
+    """
+    owners = {s: world.scene.owner(s) for s in world.support_geom}
+
+    def key(contact: str) -> tuple[str, str]:
+        surface, _, support = contact.partition("@")
+        return surface, owners.get(support, support)
+
+    return sum(sum(v for k, v in load.items() if key(k) == key(c)) for c in rests_on)
 
 
 def _at_most(value: float, limit: float) -> Criterion:

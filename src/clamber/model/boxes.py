@@ -1,7 +1,7 @@
-"""Boxes that are drawn: files of other programs -> `Box` records.
+"""What is drawn: files of other programs -> `Box` records, and shapes of other kinds.
 
-An OBJ holds boxes by their corners; an MJCF, URDF or SDF holds fixed shapes, of which
-boxes are taken, and meshes with the corners of a box.
+An OBJ holds boxes by their corners; an MJCF, URDF or SDF holds fixed shapes. Meshes
+with the corners of a box are boxes, other shapes are triangles.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -23,6 +23,7 @@ from clamber.model.description import (
     read_mesh,
     read_xml,
 )
+from clamber.model.records import short_repr
 from clamber.model.scene import GROUND, Box
 from clamber.model.se3 import matrix_from_rpy
 
@@ -32,6 +33,32 @@ _LARGEST = 1e6  # [m]
 _FIT = 2e-3  # [m] a vertex further than this from the fitted box is no box's
 _SAME = 1e-5  # of the size of all: nearer vertices are one corner
 _NO_BOX = "no other shapes than boxes are climbed: put boxes in its place"
+
+
+class NoBox(InputError):
+    """A shape that was drawn is no box."""
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Shape:
+    """A shape that is no box.
+
+    Attributes:
+        name: It has no other's.
+        vertices: (V, 3) in the world [m].
+        faces: (F, 3) counter-clockwise seen from outside.
+        friction: Coulomb coefficient.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    friction: float
+
+    __repr__ = short_repr
+
+
+Drawn = tuple[list[Box], list[Shape]]
 
 
 def read_obj(
@@ -187,7 +214,7 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
     """The box (8, 3) vertices belong to, in any order: upright if it can be."""
     if len(v) != 8:
         found = f"{len(v)} corners"
-        raise InputError(f"8 vertices of a box: {_NO_BOX}", path, name, found)
+        raise NoBox(f"8 vertices of a box: {_NO_BOX}", path, name, found)
     order = np.argsort(v[:, 2], kind="stable")
     base = v[order[:4]]
     # Of the three ways from one corner to the others the longest is the diagonal.
@@ -202,7 +229,7 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
             R = tilted
             off, low, high = _extent(v, R)
     if off > _FIT or np.any(high - low < _FIT):
-        raise InputError(
+        raise NoBox(
             "8 vertices of a box "
             f"(one is {off:.3f} m off; size {(high - low).round(3).tolist()})",
             path,
@@ -252,22 +279,22 @@ def _tilted(v: np.ndarray) -> np.ndarray | None:
 
 def read_described(
     path: Path, friction: float = DEFAULT_FRICTION
-) -> tuple[list[Box], float | None]:
-    """Boxes of an MJCF or URDF that are fixed to the world, and its plane's friction.
+) -> tuple[Drawn, float | None]:
+    """What of an MJCF or URDF is fixed to the world, and its plane's friction.
 
     Args:
         path: The file.
-        friction: Of the boxes of a URDF, which says none.
+        friction: Of the shapes of a URDF, which says none.
 
     Raises:
-        InputError: It is no such file, or holds other fixed shapes than boxes, meshes
-            of boxes and a plane.
+        InputError: It is no such file, or holds no fixed shape but a plane.
     """
     says_friction = read_xml(path).tag != "robot"
     model = compile_description(read_description(path, lenient=True), path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     boxes: list[Box] = []
+    shapes: list[Shape] = []
     ground = None
     for g in range(model.ngeom):
         body = int(model.geom_bodyid[g])
@@ -280,29 +307,86 @@ def read_described(
         if kind == mujoco.mjtGeom.mjGEOM_PLANE:
             ground = mu
             continue
-        called = _called(name, model.body(body).name if body else "", boxes)
-        where = f"geom {name!r}" if name else _place(model.body(body).name, place)
+        called = _called(name, model.body(body).name if body else "", (*boxes, *shapes))
         if kind == mujoco.mjtGeom.mjGEOM_BOX:
             size = 2.0 * model.geom_size[g]
             box = Box(name=called, size=size, position=place, rotation=R)
-        elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-            mesh = int(model.geom_dataid[g])
-            first = int(model.mesh_vertadr[mesh])
-            v = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
-            v = place + v.astype(float) @ R.T
-            box = _box_of_mesh(
-                called, v, f"{where}: mesh {model.mesh(mesh).name!r}", path
-            )
+            boxes.append(replace(box, friction=mu))
         else:
-            what = kind.name.removeprefix("mjGEOM_").lower()
-            raise InputError(f"boxes and a plane: {_NO_BOX}", path, where, what)
-        boxes.append(replace(box, friction=mu))
-    if not boxes:
-        raise InputError("a box that is fixed to the world", path, "geom")
-    return boxes, ground
+            v, faces = _triangles(model, g)
+            _add(boxes, shapes, called, place + v @ R.T, faces, mu, path)
+    if not boxes and not shapes:
+        raise InputError("a shape that is fixed to the world", path, "geom")
+    return (boxes, shapes), ground
 
 
-def _called(name: str, place: str, boxes: Sequence[Box]) -> str:
+def _add(
+    boxes: list[Box],
+    shapes: list[Shape],
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    friction: float,
+    path: Path,
+) -> None:
+    """A mesh in the world, as the box that it is, or as it is."""
+    corners = _corners(vertices)
+    if len(corners) == 8:
+        try:
+            box = _fit_box(name, corners, path)
+        except NoBox:
+            pass
+        else:
+            boxes.append(replace(box, friction=friction))
+            return
+    shapes.append(Shape(name=name, vertices=vertices, faces=faces, friction=friction))
+
+
+def _triangles(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) in the geom's frame and faces (F, 3) of a geom that is no box."""
+    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])), model.geom_size[geom]
+    data = int(model.geom_dataid[geom])
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        first, n = int(model.mesh_vertadr[data]), int(model.mesh_vertnum[data])
+        face, m = int(model.mesh_faceadr[data]), int(model.mesh_facenum[data])
+        v = model.mesh_vert[first : first + n].astype(float)
+        return v, model.mesh_face[face : face + m].astype(np.int64)
+    if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+        n, m = int(model.hfield_nrow[data]), int(model.hfield_ncol[data])
+        first, (x, y, high, _) = int(model.hfield_adr[data]), model.hfield_size[data]
+        heights = model.hfield_data[first : first + n * m].reshape(n, m) * high
+        return grid_triangles(np.linspace(-x, x, m), np.linspace(-y, y, n), heights)
+    word = kind.name.removeprefix("mjGEOM_").lower()
+    return _round_shape(word, size)
+
+
+def grid_triangles(
+    x: np.ndarray, y: np.ndarray, heights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of heights (rows, columns) at x and y."""
+    X, Y = np.meshgrid(x, y)
+    i = np.arange(X.size).reshape(X.shape)
+    a, b, c, d = i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]
+    halves = (a, b, d), (a, d, c)
+    faces = np.concatenate([np.stack(f, axis=-1).reshape(-1, 3) for f in halves])
+    return np.stack([X, Y, heights], axis=-1).reshape(-1, 3).astype(float), faces
+
+
+def _round_shape(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a sphere, capsule, cylinder or ellipsoid along z."""
+    from trimesh import creation  # slow to import, and few need it
+
+    if kind == "cylinder":
+        mesh = creation.cylinder(radius=size[0], height=2.0 * size[1], sections=48)
+    elif kind == "capsule":
+        mesh = creation.capsule(height=2.0 * size[1], radius=size[0], count=(24, 48))
+    else:
+        mesh = creation.icosphere(subdivisions=3)
+        mesh.apply_scale(size if kind == "ellipsoid" else size[0])
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def _called(name: str, place: str, boxes: Sequence[Box | Shape]) -> str:
     """A box's name: its own, or that of the body it is on, or its number."""
     taken = {b.name for b in boxes} | {GROUND}
     for wanted in (name, place, *(f"{place}{k}" for k in range(2, len(boxes) + 2))):
@@ -312,32 +396,14 @@ def _called(name: str, place: str, boxes: Sequence[Box]) -> str:
     return f"box{len(boxes) + 1}"
 
 
-def _place(body: str, position: np.ndarray) -> str:
-    """What a shape without a name is called in messages."""
-    at = ", ".join(f"{x:.3g}" for x in position)
-    return f"the geom at ({at})" + (f" of {body!r}" if body else "")
-
-
-def _box_of_mesh(name: str, v: np.ndarray, where: str, path: Path) -> Box:
-    """The box whose corners the vertices of a mesh are, in the world."""
-    corners = _corners(v)
-    if len(corners) == 8:
-        try:
-            return _fit_box(name, corners, path)
-        except InputError:
-            pass
-    expected = f"the corners of a box: {_NO_BOX}"
-    raise InputError(expected, path, where, f"{len(corners)} corners")
-
-
 # SDF, Gazebo's description of worlds and models.
 
 
-def read_sdf(path: Path, friction: float = DEFAULT_FRICTION) -> list[Box]:
-    """Boxes of the static models of an SDF; of all models where none is static.
+def read_sdf(path: Path, friction: float = DEFAULT_FRICTION) -> Drawn:
+    """Shapes of the static models of an SDF; of all models where none is static.
 
     Raises:
-        InputError: It is no such file, or holds what is no box.
+        InputError: It is no such file, or holds no shape but a plane.
     """
     root = read_xml(path)
     models = list(root.iter("model"))
@@ -350,6 +416,7 @@ def read_sdf(path: Path, friction: float = DEFAULT_FRICTION) -> list[Box]:
         raise InputError(expected, path, "<include>", uri)
     static = [m for m in models if _is_true(m.findtext("static", ""))]
     boxes: list[Box] = []
+    shapes: list[Shape] = []
     for model in static or models:
         for link in model.findall("link"):
             for shape in link.findall("collision"):
@@ -359,43 +426,55 @@ def read_sdf(path: Path, friction: float = DEFAULT_FRICTION) -> list[Box]:
                 for element in (model, link, shape):
                     R_next, p_next = _pose(element, where, path)
                     R, p = R @ R_next, p + R @ p_next
-                name = _called("", label[0] if len(model) else "", boxes)
-                box = _sdf_box(shape, name, R, p, where, path)
-                if box is not None:
-                    mu = shape.findtext("surface/friction/ode/mu")
-                    mu = friction if mu is None else min(_number(mu, where, path), 1.0)
+                name = label[0] if len(model) else ""
+                name = _called("", name, (*boxes, *shapes))
+                text = shape.findtext("surface/friction/ode/mu")
+                mu = friction if text is None else min(_number(text, where, path), 1.0)
+                found = _sdf_shape(shape, where, path)
+                if isinstance(found, np.ndarray):
+                    box = Box(name=name, size=found, position=p, rotation=R)
                     boxes.append(replace(box, friction=mu))
-    if not boxes:
-        raise InputError("a collision shape that is a box", path, "<collision>")
-    return boxes
+                elif found is not None:
+                    _add(boxes, shapes, name, p + found[0] @ R.T, found[1], mu, path)
+    if not boxes and not shapes:
+        raise InputError("a collision shape", path, "<collision>")
+    return boxes, shapes
 
 
-def _sdf_box(
-    shape: ElementTree.Element,
-    name: str,
-    R: np.ndarray,
-    p: np.ndarray,
-    where: str,
-    path: Path,
-) -> Box | None:
-    """Of a collision at a pose; None of a plane."""
+def _sdf_shape(
+    shape: ElementTree.Element, where: str, path: Path
+) -> np.ndarray | tuple[np.ndarray, np.ndarray] | None:
+    """Size (3,) of a box, vertices and faces of another collision; None of a plane."""
     geometry = shape.find("geometry")
     kinds = [] if geometry is None else list(geometry)
     kind = kinds[0] if kinds else ElementTree.Element("nothing")
+
+    def number(key: str) -> float:
+        return _number(kind.findtext(key, ""), where, path)
+
     if kind.tag == "plane":
         return None
     if kind.tag == "box":
         size = _numbers(kind.findtext("size", ""), 3, where, path)
         if np.any(size <= 0):
             raise InputError("positive lengths", path, where, size.tolist())
-        return Box(name=name, size=size, position=p, rotation=R)
+        return size
     if kind.tag == "mesh":
         uri = kind.findtext("uri", "")
         scale = _numbers(kind.findtext("scale", "1 1 1"), 3, where, path)
         file = path.parent / re.sub(r"^(file|model|package)://", "", uri)
-        v = read_mesh(file).vertices * scale
-        return _box_of_mesh(name, p + v @ R.T, f"{where}: mesh {uri!r}", path)
-    raise InputError(f"boxes and a plane: {_NO_BOX}", path, where, kind.tag)
+        found = read_mesh(file)
+        return found.vertices * scale, found.triangles
+    if kind.tag in ("cylinder", "capsule"):
+        half = number("length") / 2
+        return _round_shape(kind.tag, np.array([number("radius"), half, 0.0]))
+    if kind.tag == "sphere":
+        return _round_shape(kind.tag, np.array([number("radius"), 0.0, 0.0]))
+    if kind.tag == "ellipsoid":
+        radii = _numbers(kind.findtext("radii", ""), 3, where, path)
+        return _round_shape(kind.tag, radii)
+    known = "box, cylinder, sphere, capsule, ellipsoid, mesh or plane"
+    raise InputError(known, path, where, kind.tag)
 
 
 def _pose(

@@ -386,6 +386,30 @@ def read_mesh(path: Path) -> MeshFile:
     Raises:
         InputError: It cannot be read, or is broken or too large.
     """
+    corners, _, upright = read_shapes(path)
+    if not np.isfinite(corners).all():
+        raise InputError("a mesh of finite numbers", path)
+    vertices, faces = np.unique(
+        corners.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True
+    )
+    faces = faces.reshape(-1, 3)
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if len(faces) == 0:
+        raise InputError("a mesh with triangles", path)
+    return MeshFile(vertices=vertices.astype(float), triangles=faces, upright=upright)
+
+
+def read_shapes(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a file of meshes holds, as it is: some of it may be no numbers.
+
+    Returns:
+        Corners (F, 3, 3) of triangles and points (N, 3) that are of none, in metres or
+        the file's own unit, and the turn to z up, see `MeshFile`.
+
+    Raises:
+        InputError: It cannot be read, or is broken or too large.
+    """
     kind, scale, upright = path.suffix.lower().removeprefix("."), 1.0, np.eye(3)
     try:
         if path.suffix.lower() == COLLADA:
@@ -405,22 +429,20 @@ def read_mesh(path: Path) -> MeshFile:
                 ignore_broken=False,
                 skip_materials=True,
             )
+            clouds = [
+                np.asarray(g.vertices)
+                for g in scene.geometry.values()
+                if isinstance(g, trimesh.PointCloud)
+            ]
+            points = np.concatenate([np.zeros((0, 3)), *clouds])
+            if clouds and len(clouds) == len(scene.geometry):
+                return np.zeros((0, 3, 3)), points, upright
             corners = scale * np.asarray(scene.to_mesh().triangles)
     except InputError:
         raise
     except Exception as e:  # the libraries raise whatever they trip over
         raise InputError(f"a {path.suffix} mesh ({_one_line(e)})", path) from e
-    if not np.isfinite(corners).all():
-        raise InputError("a mesh of finite numbers", path)
-    vertices, faces = np.unique(
-        corners.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True
-    )
-    faces = faces.reshape(-1, 3)
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
-    if len(faces) == 0:
-        raise InputError("a mesh with triangles", path)
-    return MeshFile(vertices=vertices.astype(float), triangles=faces, upright=upright)
+    return corners, points, upright
 
 
 def _is_for_mujoco(path: Path) -> bool:

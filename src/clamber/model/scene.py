@@ -1,4 +1,4 @@
-"""The scene: a ground plane and boxes, whose flat tops are the supports.
+"""The scene: a ground plane, boxes and meshes, whose flat parts are the supports.
 
 A `Support` frame P has its origin in the middle of the surface and z along the outward
 normal; its convex polygon is given in that frame's x and y, counter-clockwise. Files
@@ -84,7 +84,8 @@ class Support:
     """A flat convex region that can bear load.
 
     Attributes:
-        name: `ground`, or the box whose top it is.
+        name: `ground`, the box whose top it is, or the mesh that it is of, numbered
+            where that has several.
         position: (3,) origin of P in the world [m].
         rotation: (3, 3) R_WP; its last column is the outward normal.
         polygon: (K, 2) vertices in P, counter-clockwise [m].
@@ -282,17 +283,78 @@ class Box:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Rejected:
+    """A flat part of a mesh that is no support.
+
+    Attributes:
+        outline: (K, 3) its border in the world [m].
+        why: It is none, in words.
+    """
+
+    outline: np.ndarray
+    why: str
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """Copy the outline."""
+        object.__setattr__(self, "outline", frozen_array(self.outline, (-1, 3)))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Mesh:
+    """Terrain of any shape, as planning and physics know it (made by `patches`).
+
+    Attributes:
+        name: Its supports are called by it.
+        pieces: Convex solids, each the hull of corners (K, 3) in the world [m].
+        supports: Flat parts that bear load.
+        under: Of each support, the piece that it lies on.
+        friction: Coulomb coefficient.
+        roughness: It is uneven by about this [m], see `Box`.
+        rejected: Flat parts that bear none.
+        notes: What was mended in the file, a sentence each.
+    """
+
+    name: str
+    pieces: tuple[np.ndarray, ...]
+    supports: tuple[Support, ...]
+    under: tuple[int, ...]
+    friction: float = 0.8
+    roughness: float = 0.0
+    rejected: tuple[Rejected, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """Copy the arrays and check that each support lies on a piece."""
+        pieces = tuple(frozen_array(p, (-1, 3)) for p in self.pieces)
+        object.__setattr__(self, "pieces", pieces)
+        if len(self.under) != len(self.supports) or any(
+            not 0 <= i < len(pieces) for i in self.under
+        ):
+            raise ValueError(f"mesh {self.name}: a piece under each support")
+
+    def piece_name(self, i: int) -> str:
+        """What the geom of a piece is called; no support is called so."""
+        return f"{self.name}.{i}"
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Scene:
-    """Ground and boxes, where the robot starts and where it should get.
+    """Ground, boxes and meshes, where the robot starts and where it should get.
 
     Attributes:
         boxes: Obstacles; the first is the one to climb where no goal is named.
+        meshes: Obstacles of other shapes.
         ground_friction: Coulomb coefficient of the ground.
         start: (3,) ankles' midpoint x, y [m] and yaw [rad].
         goal: (2,) pelvis x, y or (3,) with yaw; None for "on top of the first box".
     """
 
     boxes: tuple[Box, ...] = ()
+    meshes: tuple[Mesh, ...] = ()
     ground_friction: float = 0.8
     start: np.ndarray
     goal: np.ndarray | None = None
@@ -304,7 +366,8 @@ class Scene:
         object.__setattr__(self, "start", frozen_array(self.start, (3,)))
         if self.goal is not None:
             object.__setattr__(self, "goal", frozen_array(self.goal, (-1,)))
-        names = [b.name for b in self.boxes]
+        names = [*(x.name for x in (*self.boxes, *self.meshes))]
+        names += [s.name for m in self.meshes for s in m.supports if s.name != m.name]
         if len({*names, GROUND}) != len(names) + 1:
             raise ValueError(f"names are not unique: {names}")
 
@@ -322,8 +385,30 @@ class Scene:
 
     @property
     def supports(self) -> tuple[Support, ...]:
-        """Ground first, then the tops of the boxes in order."""
-        return (self.ground, *(b.top for b in self.boxes))
+        """Ground first, then the tops of the boxes in order, then those of meshes."""
+        return (self.ground, *self.tops)
+
+    @property
+    def tops(self) -> tuple[Support, ...]:
+        """What may be climbed on: the supports but for the ground."""
+        meshes = (s for m in self.meshes for s in m.supports)
+        return (*(b.top for b in self.boxes), *meshes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was mended in the files of meshes, a sentence each."""
+        return tuple(f"{m.name}: {note}" for m in self.meshes for note in m.notes)
+
+    def owner(self, name: str) -> str:
+        """The mesh that a support or a piece is of; else the name itself."""
+        for m in self.meshes:
+            if name.partition(".")[0] == m.name or name in {s.name for s in m.supports}:
+                return m.name
+        return name
+
+    def kind(self, name: str) -> str:
+        """The key of a support's shape in a scene file: `boxes` or `meshes`."""
+        return "boxes" if name in {b.name for b in self.boxes} else "meshes"
 
     def below(self, point: np.ndarray, slack: float = 0.0) -> Support | None:
         """The highest support under a point (3,); None where there is none.

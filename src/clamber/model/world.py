@@ -11,7 +11,7 @@ are the floating base.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -26,9 +26,13 @@ from clamber.model.scene import GROUND, Scene, Support
 from clamber.model.se3 import matrix_from_quat, quat_from_yaw
 from clamber.model.terrain import SceneLike, load_scene
 
+OBSTACLE = (0.76, 0.60, 0.42, 1.0)  # its colour
 PHYSICS_STEP = 0.001  # [s]
 SOLREF = (0.005, 1.0)  # contacts of supports: time constant [s], damping ratio
 IMPRATIO = 10.0  # friction stiffer than normal force: no creep while standing
+NEAR_SUPPORT = 0.25  # [m] a surface in contact with a support touches no farther
+UNEVEN = 0.012  # [m] what rises less from a support belongs to it
+GENTLE = 1.0  # tangent of the steepest rise beside a support that may be touched
 BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
 CLEAR = 0.002  # [m] that they keep from boxes at the start
 DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
@@ -277,9 +281,22 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
             pos=b.position,
             quat=quat,
             friction=[b.friction, 0.02, 0.001],
-            rgba=[0.76, 0.60, 0.42, 1.0],
+            rgba=list(OBSTACLE),
             **common,
         )
+    for mesh in scene.meshes:
+        for i, piece in enumerate(mesh.pieces):
+            name = mesh.piece_name(i)
+            asset = spec.add_mesh(name=name, uservert=piece.ravel())
+            asset.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            world.add_geom(
+                name=name,
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=name,
+                friction=[mesh.friction, 0.02, 0.001],
+                rgba=list(OBSTACLE),
+                **common,
+            )
 
 
 def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> World:
@@ -313,6 +330,8 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
     pairs = _pairs(model, data, base)
     home = _stand_clear(model, data, robot, scene, home, surfaces, pairs)
     supports = {s.name: s for s in scene.supports}
+    geoms = _support_geoms(model, scene)
+    names = {g: name for name, g in reversed(geoms.items())}
     return World(
         model=model,
         xml=xml,
@@ -334,19 +353,16 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         kd=gains[:, 1],
         ki=gains[:, 2],
         pairs=pairs,
-        support_geom={name: model.geom(name).id for name in supports},
+        support_geom=geoms,
         support_of_geom={
             g: name
             for name in supports
             for g in range(model.ngeom)
             if model.geom_bodyid[g] == 0 and has_prefix(model.geom(g).name, name)
-        },
+        }
+        | names,
         supports=supports,
-        touching={
-            (name, support): _touching(model, pairs, surface, model.geom(support).id)
-            for name, surface in surfaces.items()
-            for support in supports
-        },
+        touching=_touching(model, scene, pairs, surfaces, geoms),
         base=base,
         mass=float(model.body_subtreemass[base]),
     )
@@ -543,12 +559,69 @@ def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
     return np.array(out, dtype=np.int32).reshape(-1, 2)
 
 
+def _support_geoms(model: mujoco.MjModel, scene: Scene) -> dict[str, int]:
+    """The geom of each support, and of each piece of a mesh, by name."""
+    names = {s.name: s.name for s in (scene.ground, *(b.top for b in scene.boxes))}
+    for m in scene.meshes:
+        for s, i in zip(m.supports, m.under, strict=True):
+            names[s.name] = m.piece_name(i)
+    for m in scene.meshes:
+        names |= {n: n for n in map(m.piece_name, range(len(m.pieces)))}
+    return {name: model.geom(geom).id for name, geom in names.items()}
+
+
 def _touching(
-    model: mujoco.MjModel, pairs: np.ndarray, surface: Surface, support: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the pairs of a surface with a support's geom: planned, further."""
-    mine = np.isin(pairs, surface.geoms).any(axis=1)
-    here = mine & (pairs == support).any(axis=1)
-    main = [g for g in surface.geoms if model.geom(g).name == surface.name]
-    planned = np.isin(pairs, main).any(axis=1) | surface.is_flat
-    return np.flatnonzero(here & planned), np.flatnonzero(here & ~planned)
+    model: mujoco.MjModel,
+    scene: Scene,
+    pairs: np.ndarray,
+    surfaces: Mapping[str, Surface],
+    geoms: Mapping[str, int],
+) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]:
+    """By surface and support, indices of the pairs that touch: planned, further.
+
+    A support of a mesh goes on in the pieces beside it: those that do not rise from it
+    may touch like its own; those that rise gently, like further geoms of the surface.
+    """
+    index = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
+    pieces = [
+        (m.piece_name(i), p) for m in scene.meshes for i, p in enumerate(m.pieces)
+    ]
+    out = {}
+    for support in scene.supports:
+        own, gentle = [geoms[support.name]], []
+        for name, corners in pieces if support.name != GROUND else ():
+            rise = _rise(support, corners)
+            if geoms[name] != own[0] and rise is not None and rise < GENTLE:
+                (own if rise <= 0.0 else gentle).append(geoms[name])
+        for name, surface in surfaces.items():
+            main = [g for g in surface.geoms if model.geom(g).name == surface.name]
+            if surface.is_flat:
+                main = list(surface.geoms)
+
+            def of(mine: Sequence[int], theirs: Sequence[int]) -> list[int]:
+                keys = [(min(a, b), max(a, b)) for a in mine for b in theirs]
+                return sorted(index[k] for k in keys if k in index)
+
+            rest = [g for g in surface.geoms if g not in main]
+            further = sorted({*of(rest, own), *of(surface.geoms, gentle)})
+            out[name, support.name] = (
+                np.array(of(main, own), dtype=np.int64),
+                np.array(further, dtype=np.int64),
+            )
+    return out
+
+
+def _rise(support: Support, piece: np.ndarray) -> float | None:
+    """How steeply a piece (K, 3) rises beside a support: the tangent; None: far off.
+
+    What rises over the support itself is as steep as can be, but for unevenness.
+    """
+    height = support.height(piece)
+    A, b = support.edges()
+    beside = (piece @ A.T - b).max(axis=1)
+    if beside.min() > NEAR_SUPPORT or height.max() < -NEAR_SUPPORT:
+        return None
+    over = height - UNEVEN
+    if over.max() <= 0.0:
+        return 0.0
+    return float((over / np.maximum(beside, 1e-9))[over > 0.0].max())

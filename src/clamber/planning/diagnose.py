@@ -271,7 +271,12 @@ def check_start(ik: IK, start: Keyframe) -> None:
     names = (
         [] if pair < 0 else [world.model.geom(int(g)).name for g in world.pairs[pair]]
     )
-    boxes = [b.name for b in world.scene.boxes if b.name in names]
+    scene = world.scene
+    boxes = [
+        x.name
+        for x in (*scene.boxes, *scene.meshes)
+        if x.name in map(scene.owner, names)
+    ]
     if depth > 0 and boxes:
         raise InputError(
             "a start where no box is: move the one or the other",
@@ -305,12 +310,14 @@ def check_reach(ik: IK) -> None:
     trunk = float(np.linalg.norm(shoulder - hip))
     reach = trunk + sum(limb_lengths(kin).values())
     start = np.array([*world.scene.start[:2], 0.0])
-    for box in world.scene.boxes[:1]:
-        distance = float(np.linalg.norm(box.top.nearest(start) - start))
+    tops = world.scene.tops if world.scene.meshes else world.scene.tops[:1]
+    if tops:
+        away = [float(np.linalg.norm(t.nearest(start) - start)) for t in tops]
+        distance, box = min(zip(away, tops, strict=True), key=lambda x: x[0])
         if distance > reach:
             raise InputError(
                 f"the nearest point of its top within {reach:.2f} m of the start,"
                 " the robot's reach",
-                field=f"scene.boxes.{box.name}",
+                field=f"scene.{world.scene.kind(box.name)}.{box.name}",
                 value=f"{distance:.2f} m away",
             )

@@ -131,7 +131,7 @@ class Gait:
                 raise InputError(
                     f"a top within {height:.2f} m, what the robot reaches, between"
                     " start and goal",
-                    field=f"scene.boxes.{name}",
+                    field=f"scene.{self.world.scene.kind(name)}.{name}",
                     value=f"{top:.2f} m high",
                 )
         first = self.platforms[0]
@@ -140,7 +140,7 @@ class Gait:
             raise InputError(
                 f"an obstacle within {reach:.2f} m, the robot's reach: it must first"
                 f" walk {away - self.proportions.stand:.2f} m",
-                field=f"scene.boxes.{first.boxes[0]}",
+                field=f"scene.{self.world.scene.kind(first.boxes[0])}.{first.boxes[0]}",
                 value=f"{away:.2f} m away",
             )
 

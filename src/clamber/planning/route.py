@@ -125,16 +125,16 @@ def goal_of(scene: Scene) -> np.ndarray:
                 value=[float(x) for x in goal],
             )
         return goal
-    if not scene.boxes:
+    if not scene.tops:
         raise InputError("a goal, or a box to get on top of", field="scene.goal")
-    return scene.boxes[0].top.position[:2]
+    return scene.tops[0].position[:2]
 
 
 def find_platforms(scene: Scene, goal: np.ndarray) -> tuple[Platform, ...]:
     """The platforms between the scene's start and `goal` (2,), in order."""
     start = scene.start[:2]
     length = float(np.linalg.norm(goal - start))
-    crossed = [(crossing(b.top, start, goal), b.top) for b in scene.boxes]
+    crossed = [(crossing(top, start, goal), top) for top in scene.tops]
     met = sorted(((*c, top) for c, top in crossed if c), key=lambda m: m[0])
     groups: list[list[tuple[float, float, Support]]] = []
     end = -math.inf
@@ -235,7 +235,7 @@ def find_place(
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     order = np.argsort(np.linalg.norm(grid, axis=1), kind="stable")
     points = wanted + grid[order]
-    tops = [box.top for box in scene.boxes]
+    tops = scene.tops
     gap = np.array([(points @ A.T - b).max(axis=1) for A, b in map(_sides, tops)])
     height = np.array([top.level(points) for top in tops])
     best = None
@@ -258,7 +258,7 @@ def find_place(
 def room_on(scene: Scene, boxes: tuple[str, ...], xy: np.ndarray) -> float:
     """From a point (2,) on some boxes to the nearest other one; inf: there is none."""
     room = math.inf
-    for top in (b.top for b in scene.boxes if b.name not in boxes):
+    for top in (s for s in scene.tops if s.name not in boxes):
         corners, (A, b) = top.vertices[:, :2], _sides(top)
         if (A @ xy - b).max() <= 0.0:
             return 0.0

@@ -81,6 +81,7 @@ def _write_scene(scene: Scene) -> dict[str, Any]:
             }
             for b in scene.boxes
         ],
+        **({"meshes": scene.meshes} if scene.meshes else {}),
         "start": scene.start,
         "goal": scene.goal,
     }
@@ -100,8 +101,8 @@ def _read_scene(at: At) -> Scene:
             )
         )
     friction = CODEC.decode(float, at.key("ground").key("friction"))
-    ends = CODEC.fields(Scene, at, without=("boxes", "ground_friction"))
-    return Scene(boxes=tuple(boxes), ground_friction=friction, **ends)
+    rest = CODEC.fields(Scene, at, without=("boxes", "ground_friction"))
+    return Scene(boxes=tuple(boxes), ground_friction=friction, **rest)
 
 
 def _rpy(R: np.ndarray) -> np.ndarray:

@@ -56,6 +56,7 @@ from clamber.show.renderer import (
     Preset,
     View,
     frame_view,
+    outline,
     robot_corners,
     seen_points,
     view_of,
@@ -69,6 +70,9 @@ PLOTS = 14.0  # of a run take as long as so many pictures of a sheet
 SAMPLES = 400  # of a plot over time
 FRAME_SIZE = (1920, 1080)
 CLOSE = 0.12  # [height of the motion] around it boxes are in a sheet's pictures
+REFUSED = (0.72, 0.11, 0.11, 1.0)  # outlines of what is no support
+MOST_REFUSED = 12  # of them are said why
+FEW = 8  # supports that are marked in full size
 TILE = (400, 330)  # of the sheet of keyframes
 
 
@@ -122,6 +126,8 @@ def draw_scene(
 ) -> Path:
     """Draw a scene with the robot at its start, its supports named, the goal marked.
 
+    Of a mesh the supports are outlined, and in red what is none, with the reason.
+
     Args:
         robot: A robot, its name, or its `robot.yaml`.
         scene: A scene, its file, or the height of one box [m].
@@ -136,23 +142,39 @@ def draw_scene(
     kin = Kinematics(world)
     kin.update(world.home)
     tops = [s for s in scene.supports if s.name != GROUND]
-    seen = np.concatenate([robot_corners(kin), *(s.vertices for s in tops)])
-    view = view_of(world, seen, tile[0] / tile[1])
+    refused = [r for m in scene.meshes for r in m.rejected]
+    seen = [robot_corners(kin), *(s.vertices for s in tops)]
+    seen += [r.outline for r in refused]
+    view = view_of(world, np.concatenate(seen), tile[0] / tile[1])
+    lines = [x for r in refused for x in outline(r.outline, REFUSED)]
     with Camera(world, tile) as camera:
-        picture = camera.shot(world.home, view)
+        picture = camera.shot(world.home, view, lines)
     draw = ImageDraw.Draw(picture)
+    shown = [r for r in refused if _is_told(r.outline, view)]
+    for r in shown[:MOST_REFUSED]:
+        at = view.project(r.outline.mean(axis=0), tile)
+        draw.text(tuple(at), r.why, font=font(12), fill=(185, 28, 28), anchor="mm")
+    length, size = (0.15, 15) if len(tops) <= FEW else (0.06, 11)
     for s in tops:
         at, tip = view.project(
-            np.stack([s.position, s.position + 0.15 * s.normal]), tile
+            np.stack([s.position, s.position + length * s.normal]), tile
         )
         arrow(draw, at, tip, DARK)
-        draw.text((at[0] + 8, at[1] + 4), s.name, font=font(15), fill=DARK)
+        draw.text((at[0] + 8, at[1] + 4), s.name, font=font(size), fill=DARK)
     if scene.goal is not None:
         at = tuple(view.project(np.array([*scene.goal[:2], 0.0]), tile))
         dot(draw, at, 6, PHASE_COLOURS["supporting"])
         draw.text((at[0] + 8, at[1] - 8), "goal", font=font(15), fill=DARK)
-    caption = f"{len(tops)} boxes, {robot.name} at the start"
+    of = "supports" if scene.meshes else "boxes"
+    caption = f"{len(tops)} {of}, {robot.name} at the start"
     return _save_sheet([(picture, [caption])], path, columns=1)
+
+
+def _is_told(outline: np.ndarray, view: View) -> bool:
+    """Whether to say why a polygon (K, 3) is no support: not of walls, or backs."""
+    normal = np.cross(outline, np.roll(outline, -1, axis=0)).sum(axis=0)
+    wall = normal[2] < 0.5 * float(np.linalg.norm(normal))
+    return not wall and float(normal @ view.axes[2]) < 0.0
 
 
 def keyframe_sheet(

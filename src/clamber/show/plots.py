@@ -77,8 +77,8 @@ def _height_figure(
     fig = Figure(figsize=(10, 5.4), layout="constrained")
     axes = fig.subplots(2, 2, sharex=True, sharey=True).ravel().tolist()
     for ax, (limb, surfaces) in zip(axes, panels.items(), strict=True):
-        for box in scene.boxes:
-            ax.axhline(box.top.position[2], color="0.45", ls=":", lw=1)
+        for top in scene.tops:
+            ax.axhline(top.position[2], color="0.45", ls=":", lw=1)
         ax.axhline(0.0, color="0.45", ls=":", lw=1)
         for s, colour in zip(surfaces, SURFACE_COLOURS, strict=False):
             ax.plot(t, tracks[s], color=colour, lw=0.9, alpha=0.8, label=s)

@@ -63,7 +63,7 @@ CAP_PALE: Colour = (0.66, 0.69, 0.73, 1.0)
 CAP_NEAR, CAP_REACH, CAP_SHARE = 0.8, 0.95, 0.5  # [radius of the shape around a joint]
 EDGE_COLOUR: Colour = (0.32, 0.26, 0.20, 1.0)
 EDGE_LIFT, EDGE_WIDTH = 0.002, 1.5  # [m], [pixels]
-MOST_EDGED = 40  # boxes; of more, as of a terrain, the edges are left out
+MOST_EDGED = 40  # boxes, or supports of a mesh: of more the edges are left out
 EXTRA_SHAPES = 1500  # beside those of the model
 SUN, FILL, AMBIENT = 0.62, 0.26, 0.34  # of the light, colourless
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -209,6 +209,9 @@ class Camera:
             for b in (boxes if len(boxes) <= MOST_EDGED else ())
             for edge in _edges(b.size, b.position, b.rotation)
         ]
+        for mesh in () if cutout else world.scene.meshes:
+            for s in mesh.supports[:MOST_EDGED]:
+                self._edges += outline(s.vertices + EDGE_LIFT * s.normal, EDGE_COLOUR)
         self._caps = _joint_caps(model, world)
         self._frame = (width, height)
         self._shade = (width, height) if fine else (size[0] // 2, size[1] // 2)
@@ -367,6 +370,12 @@ def _plain(
     geom.specular, geom.shininess = 0.1, 0.2
 
 
+def outline(corners: np.ndarray, colour: Colour) -> Iterator[Shape]:
+    """The lines around a polygon of corners (K, 3) [m]."""
+    for ends in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        yield bar(mujoco.mjtGeom.mjGEOM_LINE, np.array(ends), EDGE_WIDTH, colour)
+
+
 def _edges(
     size: np.ndarray, centre: np.ndarray, rotation: np.ndarray
 ) -> Iterator[Shape]:
@@ -466,7 +475,8 @@ def _dressed(world: World, size: tuple[int, int]) -> mujoco.MjModel:
         else:
             continue
         model.tex_data[first : first + texels.size] = texels.ravel()
-    boxes = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+    kinds = (mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_MESH.value)
+    boxes = (model.geom_bodyid == 0) & np.isin(model.geom_type, kinds)
     model.geom_rgba[boxes] = BOX_COLOUR
     # Shapes that bear on something stand out of a robot's own meshes like balls; as
     # pads of rubber they belong to it.
@@ -570,8 +580,8 @@ def obstacle_points(scene: Scene, points: np.ndarray, near: float = NEAR) -> np.
     room = near * float(np.ptp(points[:, 2])) * np.array([1.0, 1.0, 0.0])
     low, high = points.min(axis=0) - room, points.max(axis=0) + room
     found = [np.zeros((0, 3))]
-    for box in scene.boxes:
-        corners = box_corners(box.size, box.position, box.rotation)
+    boxes = (box_corners(b.size, b.position, b.rotation) for b in scene.boxes)
+    for corners in (*boxes, *(p.copy() for m in scene.meshes for p in m.pieces)):
         if np.all(corners.max(axis=0)[:2] >= low[:2]) and np.all(
             corners.min(axis=0)[:2] <= high[:2]
         ):

@@ -35,6 +35,7 @@ from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
+from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.run.codec import whole_file
 from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, fallback_note
@@ -278,7 +279,7 @@ def _motion(
         "times": _base64(m.time, "<f4"),
         "arrays": arrays,
         "meshes": [_mesh_record(x) for x in meshes],
-        "edges": _box_edges(world.model),
+        "edges": _box_edges(world.model, world.scene),
         "seen": seen_points(kin, m.q),
         "start": float(world.scene.start[2]),
         "reach": reach,
@@ -309,8 +310,8 @@ def _poses(kin: Kinematics, meshes: list[Mesh], q: np.ndarray) -> np.ndarray:
     return out
 
 
-def _box_edges(model: mujoco.MjModel) -> list[float]:
-    """Ends of the edges of the boxes that stand in the world [m], 6 numbers an edge."""
+def _box_edges(model: mujoco.MjModel, scene: Scene) -> list[float]:
+    """Ends of the edges of boxes and of supports of meshes [m], 6 numbers an edge."""
     ends = [(a, b) for a in range(8) for b in (a | 1, a | 2, a | 4) if b > a]
     out: list[float] = []
     for g in np.flatnonzero(model.geom_bodyid == 0):
@@ -321,6 +322,9 @@ def _box_edges(model: mujoco.MjModel) -> list[float]:
         size = 2 * model.geom_size[g]
         points = box_corners(size, model.geom_pos[g], R.reshape(3, 3))
         out += np.round(points[np.array(ends)], 5).ravel().tolist()
+    for s in (s for m in scene.meshes for s in m.supports):
+        lines = np.stack([s.vertices, np.roll(s.vertices, -1, axis=0)], axis=1)
+        out += np.round(lines, 5).ravel().tolist()
     return out
 
 

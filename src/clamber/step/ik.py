@@ -224,6 +224,10 @@ class IK:
         for box in world.scene.boxes:
             of_box = world.pairs == world.support_geom[box.name]
             rough[of_box.any(axis=1)] = box.roughness
+        for mesh in world.scene.meshes:
+            names = map(mesh.piece_name, range(len(mesh.pieces)))
+            own = [world.support_geom[n] for n in names]
+            rough[np.isin(world.pairs, own).any(axis=1)] = mesh.roughness
         for (geom, support), more in extra.items():
             pair = geom, world.support_geom[support]
             mine = np.isin(world.pairs, pair).all(axis=1)
