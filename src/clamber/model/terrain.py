@@ -271,7 +271,7 @@ def load_scene(path: SceneLike) -> Scene:
     try:
         return file.scene(path.parent)
     except InputError as e:
-        if drawn or not isinstance(file.boxes, str):
+        if not isinstance(file.boxes, str):
             raise
         source = path if e.source is None else f"{path}, {e.source}"
         raise InputError(e.expected, source, e.field, e.value) from e
