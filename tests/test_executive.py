@@ -195,7 +195,7 @@ def test_the_hand_stops_where_it_touches(hands_plan, other_height):
     n = round((LOOK + THINKING) / PHYSICS_STEP)
     k = round(again.time / PHYSICS_STEP) - n
     q = rollout.followed.q[k + 5 : k + n - 5]
-    assert np.ptp(q, axis=0).max() < 0.01  # but for what balance adds
+    assert np.ptp(q, axis=0).max() < 0.03  # but for what balance adds
     assert not rollout.followed.v[k + 5 : k + n - 5].any()
     k = round(event.time / PHYSICS_STEP)
     p = point_at(rollout, event.time + 0.1, "LHand")

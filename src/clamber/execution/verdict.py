@@ -217,7 +217,6 @@ def self_penetration(world: World, qpos: np.ndarray) -> tuple[float, str]:
     return worst, pair
 
 
-@checks_types
 def strained_joint(rollout: Rollout) -> tuple[str, float, float] | None:
     """The joint that was at its effort limit for longest; None where none was.
 
@@ -234,6 +233,7 @@ def strained_joint(rollout: Rollout) -> tuple[str, float, float] | None:
     return world.joints[j], float(world.tau_max[j]), float(times[j])
 
 
+@checks_types
 def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdict:
     """Did the robot end where the plan says, on what it planned to rest on?
 

@@ -12,13 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from clamber.errors import InputError, check_kind, unreadable
 from clamber.model.boxes import grid_triangles, to_z_up
 from clamber.model.description import read_shapes
-from clamber.model.regions import merged, neighbours
 from clamber.model.scene import MAX_LENGTH
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
@@ -117,6 +114,8 @@ def mended(
     Raises:
         InputError: Nothing is left.
     """
+    from clamber.model.regions import merged  # brings SciPy and shapely with it
+
     notes, count = list(notes), len(faces)
     cell = 0.005
     while len(faces) > MOST:
@@ -163,6 +162,11 @@ def _outwards(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, int,
 
     Also how many of their edges are open.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+    from clamber.model.regions import neighbours
+
     pairs, edge = neighbours(faces, vertices)
     n = len(faces)
     start = faces[pairs, edge]

@@ -22,7 +22,6 @@ from clamber.model.boxes import (
     read_sdf,
 )
 from clamber.model.description import read_xml
-from clamber.model.patches import mesh_of
 from clamber.model.scans import (
     CLOUDS,
     MESHES,
@@ -159,6 +158,8 @@ def _mesh(
     faces: np.ndarray,
     notes: list[str],
 ) -> Mesh:
+    from clamber.model.patches import mesh_of  # brings SciPy and shapely with it
+
     check_size(vertices, path)
     return mesh_of(
         said.name,
@@ -285,6 +286,8 @@ def _name_of(path: Path) -> str:
 
 def _mesh_of_shape(shape: Shape, path: Path) -> Mesh:
     """The record; its faces may have been drawn any way round."""
+    from clamber.model.patches import mesh_of  # brings SciPy and shapely with it
+
     triangles, notes = mended(shape.vertices, shape.faces, path)
     return mesh_of(shape.name, *triangles, friction=shape.friction, notes=tuple(notes))
 
