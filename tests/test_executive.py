@@ -199,7 +199,7 @@ def test_the_hand_stops_where_it_touches(hands_plan, other_height):
     assert not rollout.followed.v[k + 5 : k + n - 5].any()
     k = round(event.time / PHYSICS_STEP)
     p = point_at(rollout, event.time + 0.1, "LHand")
-    assert p[2] == pytest.approx(TOP + height, abs=2e-3)
+    assert p[2] == pytest.approx(TOP + height, abs=0.01)  # it may bounce
     # It is measured between two recorded states.
     hand = [load(rollout, event.time + t)["LHand"] for t in (0.0, rollout.time[1])]
     assert max(hand) > 0.5 * TOUCH
