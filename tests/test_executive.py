@@ -201,7 +201,7 @@ def test_the_hand_stops_where_it_touches(hands_plan, other_height):
     p = point_at(rollout, event.time + 0.1, "LHand")
     assert p[2] == pytest.approx(TOP + height, abs=0.01)  # it may bounce
     # It is measured between two recorded states.
-    around = np.arange(-3, 2) * rollout.time[1]
+    around = np.arange(-6, 2) * rollout.time[1]
     hand = [load(rollout, event.time + t)["LHand"] for t in around]
     assert max(hand) > 0.5 * TOUCH
     # A hand that lands fast may bounce; it stays near, and the reference is still.
