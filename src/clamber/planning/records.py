@@ -36,7 +36,7 @@ class PlanOptions:
     """
 
     method: Method = "direct"
-    speed: float | Literal["max"] = 1.0
+    speed: float | Literal["max"] = 0.5
     max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 
