@@ -36,7 +36,7 @@ class PlanOptions:
     """
 
     method: Method = "direct"
-    speed: float | Literal["max"] = 0.5
+    speed: float | Literal["max"] = 0.3
     max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 
