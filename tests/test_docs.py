@@ -194,6 +194,8 @@ def read_yaml_block(block: Block, folder: Path) -> None:
         RecordingFile.model_validate(fields)
     elif names & {"boxes", "ground"}:
         SceneFile.model_validate(fields).scene(folder)
+    elif names & {"meshes", "heightfields"}:  # of files that a reader has
+        SceneFile.model_validate(fields)
     elif names & {"about", "grid", "random", "search", "controllers"}:
         fields.setdefault("base", {"height": 0.275})
         if not names & {"grid", "random", "search"}:
