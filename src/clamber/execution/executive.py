@@ -72,7 +72,6 @@ SEARCHING = 1.0  # [s] ... where other contacts are looked for
 FEEL = 0.01  # [s] later than planned that a contact may be felt
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
-SLOW = 0.5  # [rad/s] in faster motion, inertia is taken for such a load
 LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
 PART = 10_000  # samples that are followed open loop, before the next ones are made
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
@@ -157,8 +156,6 @@ class Executive:
         self._plan = plan
         self._report = progress
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
-        speed = plan.options.speed
-        self._slow = speed != "max" and speed <= SLOW
         self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
         self._searches = 0
         self.done = 0 if plan.state is None else plan.state.done
