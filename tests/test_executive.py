@@ -97,22 +97,19 @@ def end_of(plan, change: int) -> int:
     return [s.end for s in plan.trajectory.segments if s.change == change][-1] - 1
 
 
-def at_default_speed(plan):
-    """The same postures, timed as they are unless another speed is asked for."""
-    speed = PlanOptions().speed
-    trajectory = timed(plan.world, plan.changes, speed)
-    options = replace(plan.options, speed=speed)
-    return replace(plan, options=options, trajectory=trajectory)
-
-
 @pytest.fixture(scope="module")
-def fast_plan(fast_plan):
-    return at_default_speed(fast_plan)
+def fast_plan(demo_plan):
+    """The plan at the default speed."""
+    return demo_plan
 
 
 @pytest.fixture(scope="module")
 def hands_plan(hands_plan):
-    return at_default_speed(hands_plan)
+    """The same postures at the default speed."""
+    speed = PlanOptions().speed
+    trajectory = timed(hands_plan.world, hands_plan.changes, speed)
+    options = replace(hands_plan.options, speed=speed)
+    return replace(hands_plan, options=options, trajectory=trajectory)
 
 
 @pytest.fixture(scope="module")

@@ -152,8 +152,7 @@ def test_inertia_is_inverse_dynamics_less_gravity(demo_plan, demo_kinematics, rn
         sharp=np.ones(1),
         stance=np.zeros(1, int),
         stances=[key.stance],
-        makes=np.full(1, -1),
-        made=[],
+        makes=[None],
     )
     of_u, of_x = inertia_along(kin, course)
     u, x = 1.7, 2.3

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from clamber.planning.timing import BASE_LENGTH
 from clamber.planning.trajectory import (
-    BASE_LENGTH,
     HOLD_END,
     HOLD_START,
     RATE,

@@ -8,7 +8,6 @@ namespace clamber {
 namespace {
 
 constexpr double RANK = 1e-4;  // of a regularisation against a direction of length one
-constexpr int CONE_EDGES = 4;
 constexpr double LEAST = 1e-4;  // of an x that is always borne
 
 }  // namespace
@@ -19,18 +18,17 @@ void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, i
                    double share) {
     const int nv = model_.nv, na = static_cast<int>(model_.dadr.size());
     const Holding& held = planner_.look(contacts, course.q + i * model_.nq);
-    ContactPointsView points = held.points();
-    points.cone_edges = CONE_EDGES;
+    const ContactPointsView points = held.points();
     const TorqueView torque = held.torque();
     const LoadView load = held.load();
-    const int nf = points.n * CONE_EDGES, rows = 6 + na + 1;
+    const int nf = points.n * points.cone_edges, rows = 6 + na + 1;
     n_ = 2 + nf;
     m_ = n_ + rows;
     edges_.resize(3 * nf);
     auto* const edges = reinterpret_cast<double(*)[3]>(edges_.data());
     cone_generators(points, edges);
     rows_.resize((6 + na) * nf);
-    load_rows(points, load.com, torque, edges, CONE_EDGES, rows_.data());
+    load_rows(points, load.com, torque, edges, points.cone_edges, rows_.data());
 
     const double weight = model_.mass * GRAVITY;
     const double u_max = course.u_max[i], x_max = course.x_max[i];

@@ -365,8 +365,12 @@ class Executive:
             or any(map(self._is_elsewhere, self.stance))
         )
 
+    def _actual(self, c: Contact) -> Contact:
+        """The contact, or that of another surface of the limb in its place."""
+        return self.estimate.substitute(c) or c
+
     def _is_elsewhere(self, c: Contact) -> bool:
-        actual = self.estimate.substitute(c) or c
+        actual = self._actual(c)
         up, side = self.estimate.deviation(actual)
         return actual is not c or abs(up) > DEVIATION or side > DRIFT
 
@@ -399,7 +403,7 @@ class Executive:
         link = m.body(m.geom_bodyid[at.geom]).name
         self._note(Unintended, link=link, support=at.support)
         yield from self._ref.back(to)
-        actual = {c: self.estimate.substitute(c) or c for c in self.stance}
+        actual = {c: self._actual(c) for c in self.stance}
         loaded = [x for c, x in actual.items() if c is not makes]
         at_hand = self._at_hand
         yield from self._replan(tuple(actual.values()), loaded)
@@ -450,7 +454,7 @@ class Executive:
 
     def _accept(self) -> Reaction:
         """Is a contact elsewhere than planned? Then the rest is planned from there."""
-        actual = tuple(self.estimate.substitute(c) or c for c in self.stance)
+        actual = tuple(map(self._actual, self.stance))
         for c, planned in zip(actual, self.stance, strict=True):
             if self._is_elsewhere(planned):
                 self._note_moved(c, planned, made=False)

@@ -66,8 +66,11 @@ class Reference:
     @property
     def moves(self) -> bool:
         """The trajectory is being followed, and does not rest where it is."""
-        t, i = self.trajectory, self.i
-        return not self._still and bool(np.abs(t.v[i]).max() > RESTS)
+        return not self._still and self._passes(self.i)
+
+    def _passes(self, i: int) -> bool:
+        """The trajectory does not rest at a sample."""
+        return bool(np.abs(self.trajectory.v[i]).max() > RESTS)
 
     def follow(self, trajectory: Trajectory, i: int) -> None:
         """Go on, from rest, at sample `i` of another trajectory."""
@@ -82,7 +85,7 @@ class Reference:
         """
         i = self.i
         if i < to and not (until is not None and until()):
-            if self._still and i >= 0 and np.abs(self.trajectory.v[i]).max() > RESTS:
+            if self._still and i >= 0 and self._passes(i):
                 self._load_at(i, to, up=True)
             else:
                 self._load(self.trajectory, slice(i + 1, to + 1), plays=True)

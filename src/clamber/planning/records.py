@@ -15,6 +15,7 @@ from clamber.errors import InputError
 from clamber.model.records import frozen_array, short_repr
 from clamber.model.shown import Viewed
 from clamber.model.world import World
+from clamber.planning.timing import Speed
 from clamber.planning.trajectory import Trajectory
 from clamber.step.change import Change, Failure
 from clamber.step.methods import Method
@@ -36,7 +37,7 @@ class PlanOptions:
     """
 
     method: Method = "direct"
-    speed: float | Literal["max"] = 0.3
+    speed: Speed = 0.3
     max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 

@@ -23,6 +23,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
+from clamber.planning.samples import RATE
 from clamber.step.tasks import packed_contacts
 
 Speed = float | Literal["max"]
@@ -39,7 +40,7 @@ SLOW, SLOWLY = 0.3, 2.0
 TOUCH_SPEED = 0.08  # [m/s] along the normal, near a contact to be made
 TOUCH_ZONE = 0.02  # [m] what is near, in the middle of an interval
 SMOOTHING = 0.06  # [s] width of the kernel that rounds the acceleration's corners
-STEP = 0.001  # [s]
+STEP = 1.0 / RATE  # [s]
 _FLAT = 1e-3  # a path is no flatter than this: where nothing moves, nothing is limited
 
 
@@ -56,8 +57,7 @@ class Course:
             base translation scaled.
         stance: (n,) of `stances`, which contacts may bear.
         stances: By number.
-        makes: (n,) of `made`, the contact to be made soon, gently; -1 for none.
-        made: By number.
+        makes: (n,) the contact to be made soon, gently; None for none.
     """
 
     s: np.ndarray
@@ -68,8 +68,7 @@ class Course:
     sharp: np.ndarray
     stance: np.ndarray
     stances: Sequence[Sequence[Contact]]
-    makes: np.ndarray
-    made: Sequence[Contact | None]
+    makes: Sequence[Contact | None]
 
     __repr__ = short_repr
 
@@ -111,8 +110,9 @@ def fastest(
     v = JOINT_SPEED if speed == "max" else speed
     steep, bend = (np.maximum(x, _FLAT) for x in (course.steep, course.sharp))
     x_max = np.minimum((v / steep) ** 2, QUICKNESS * v / bend)
-    for i in np.flatnonzero(course.makes >= 0):
-        x_max[i] = min(x_max[i], _gentle(kin, course, int(i)))
+    for i, c in enumerate(course.makes):
+        if c is not None:
+            x_max[i] = min(x_max[i], _gentle(kin, c, course.q[i], course.slope[i]))
     slow = min(v, SLOW)
     x_slow = np.minimum((slow / steep) ** 2, SLOWLY * slow / bend)
     return kin.core.time_law(
@@ -140,17 +140,15 @@ def largest(x: np.ndarray) -> np.ndarray:
     )
 
 
-def _gentle(kin: Kinematics, course: Course, i: int) -> float:
+def _gentle(kin: Kinematics, c: Contact, q: np.ndarray, slope: np.ndarray) -> float:
     """Bound of x near a contact to be made, infinite where it is not near."""
-    c = course.made[course.makes[i]]
-    assert c is not None
     n = kin.world.supports[c.support].normal
-    kin.update(course.q[i])
+    kin.update(q)
     p = kin.contact_point(c.surface, n, c.edge)
     if (p - c.position) @ n >= TOUCH_ZONE:
         return math.inf
     J = kin.point_jacobian(kin.world.surfaces[c.surface].body, p)
-    return (TOUCH_SPEED / max(abs(float(n @ J @ course.slope[i])), 1e-9)) ** 2
+    return (TOUCH_SPEED / max(abs(float(n @ J @ slope)), 1e-9)) ** 2
 
 
 def sample_law(s: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -29,11 +29,11 @@ from clamber.planning.samples import (
     RATE,
     Run,
     Samples,
+    Spline,
     sampled,
     spline_through,
 )
 from clamber.planning.timing import (
-    BASE_LENGTH,
     Course,
     Speed,
     fastest,
@@ -173,10 +173,8 @@ def holding_torque(
     return holding_torques(kin, q[None], contacts)[0]
 
 
-def _path(
-    kin: Kinematics, phases: Sequence[Phase]
-) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of each phase its path parameters (n,), postures (n, nq) and end slopes (2, nq).
+def _path(kin: Kinematics, phases: Sequence[Phase]) -> list[Spline]:
+    """The splines of phases, without torques.
 
     Raises:
         ValueError: Two phases do not join.
@@ -205,8 +203,9 @@ def _path(
         )
         for side, q in enumerate((before[-1], after[0])):
             slopes[i, side] = _raw(q, tangent)
+    unknown = np.zeros(0), np.zeros((0, 0))
     return [
-        (s, q, np.stack([slopes[i, 1], slopes[i + 1, 0]]))
+        spline_through(s, q, np.stack([slopes[i, 1], slopes[i + 1, 0]]), *unknown)
         for i, (s, q) in enumerate(zip(parameters, postures, strict=True))
     ]
 
@@ -249,9 +248,8 @@ def _raw(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
     """(n,) path parameter: the largest joint angle travelled, base included, scaled."""
-    ways = np.abs(kin.core.differences(nodes))
-    ways[:, :3] /= BASE_LENGTH
-    return np.cumsum([0.0, *np.maximum(ways.max(axis=1), 1e-4)])
+    ways = largest(kin.core.differences(nodes))
+    return np.cumsum([0.0, *np.maximum(ways, 1e-4)])
 
 
 def _made(phases: Sequence[Phase], i: int) -> Contact | None:
@@ -311,27 +309,32 @@ def build_trajectory(
     )
 
 
-def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
-    """The phases in time."""
-    path = _path(kin, phases)
-    starts = np.cumsum([0.0, *(s[-1] for s, _, _ in path)])
+def _course(
+    phases: Sequence[Phase], path: Sequence[Spline], starts: np.ndarray
+) -> tuple[Course, list[np.ndarray]]:
+    """Phases in intervals, and the middles of each one's by its path parameter.
+
+    Args:
+        phases: In order.
+        path: Their splines.
+        starts: (n + 1,) path parameter of all where each begins, and of the end.
+    """
     edges, middles, looked, makes = [], [], [], []
-    made = [_made(phases, i) for i in range(len(phases))]
-    for i, (s, postures, ends) in enumerate(path):
+    for i, spline in enumerate(path):
+        s = spline.nodes
         parts = np.maximum(np.ceil(np.diff(s) / INTERVAL), 2).astype(int)
         edge = np.interp(np.arange(parts.sum() + 1), np.cumsum([0, *parts]), s)
         middle = 0.5 * (edge[1:] + edge[:-1])
-        spline = spline_through(s, postures, ends, middle, np.zeros((0, 0)))
-        edges.append(starts[i] + edge[1:])
-        middles.append(middle)
         fine = (edge[:-1, None] + np.diff(edge)[:, None] * _SHARES).ravel()
         most = [
             largest(x).reshape(-1, len(_SHARES)).max(axis=1)
             for x in (spline.along(fine)[1], _bend(spline.curve, fine))
         ]
         looked.append((*spline.along(middle), _bend(spline.curve, middle), *most))
-        soon = (made[i] is not None) & (middle > 0.5 * s[-1])
-        makes.append(np.where(soon, i, -1))
+        edges.append(starts[i] + edge[1:])
+        middles.append(middle)
+        made = _made(phases, i)
+        makes += [made if m > 0.5 * spline.length else None for m in middle]
     q, slope, bend, steep, sharp = map(np.concatenate, zip(*looked, strict=True))
     course = Course(
         s=np.concatenate([[0.0], *edges]),
@@ -342,9 +345,16 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
         sharp=sharp,
         stance=np.repeat(np.arange(len(phases)), [len(m) for m in middles]),
         stances=[p.contacts for p in phases],
-        makes=np.concatenate(makes),
-        made=made,
+        makes=makes,
     )
+    return course, middles
+
+
+def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
+    """The phases in time."""
+    path = _path(kin, phases)
+    starts = np.cumsum([0.0, *(spline.length for spline in path)])
+    course, middles = _course(phases, path, starts)
     inertia = of_u, of_x = inertia_along(kin, course)
     x = fastest(kin, course, inertia, speed)
     u = np.diff(x) / (2.0 * np.diff(course.s))
@@ -354,27 +364,29 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
     each = np.arange(len(phases) - 1)
     cuts = np.searchsorted(law[0], starts[1:-1], side="right") - each
     timings = np.split(law, np.maximum.accumulate(np.maximum(cuts, 1)) + each, axis=1)
-    taus, out, row = [], [], 0
-    for phase, grid, (s, *_) in zip(phases, middles, path, strict=True):
-        rows = slice(row, row + len(grid))
-        row += len(grid)
-        contacts, prices = handed_over(phase, grid / s[-1])
-        taus.append(holding_torques(kin, q[rows], contacts, prices, forces[rows]))
+    taus = []
+    for i, (phase, middle, spline) in enumerate(
+        zip(phases, middles, path, strict=True)
+    ):
+        mine = course.stance == i
+        contacts, prices = handed_over(phase, middle / spline.length)
+        q, force = course.q[mine], forces[mine]
+        taus.append(holding_torques(kin, q, contacts, prices, force))
     # Where phases join, what lies between both sides: torques have no steps.
     joints = [
         holding_torque(kin, phases[0].q[0], phases[0].load_before),
         *(0.5 * (a[-1] + b[0]) for a, b in itertools.pairwise(taus)),
         holding_torque(kin, phases[-1].q[-1], phases[-1].load_after),
     ]
-    for i, (s, postures, ends) in enumerate(path):
-        grid = np.concatenate([[0.0], middles[i], s[-1:]])
+    out = []
+    for i, spline in enumerate(path):
+        grid = np.concatenate([[0.0], middles[i], spline.nodes[-1:]])
         tau = np.stack([joints[i], *taus[i], joints[i + 1]])
         timing = timings[i].copy()
         timing[0] -= starts[i]
         lead = 0 if i else round(HOLD_START * RATE)
         rest = round(HOLD_END * RATE) if i == len(phases) - 1 else 0
-        spline = spline_through(s, postures, ends, grid, tau)
-        out.append(Run(spline, timing, lead, rest))
+        out.append(Run(replace(spline, grid=grid, tau=tau), timing, lead, rest))
     return out
 
 
