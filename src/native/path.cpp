@@ -227,7 +227,8 @@ void PathPlanner::swing(const Transition& t, Path& out) {
 // Postures from a to b, closer together where it matters: a gap is halved while, in its
 // middle, a contact has drifted or links overlap. The posture put there is the nearest to
 // the middle that satisfies the constraints: where the limb must pause while the trunk
-// rises, the way leaves the arc.
+// rises, the way leaves the arc. No posture is mended later: the first of a swing that
+// `check` will not pass ends it, and is followed by the last.
 template <typename Fill>
 void PathPlanner::fill(const std::vector<double>& a, const std::vector<double>& b,
                        int points, const std::vector<Contact>& contacts,
@@ -236,26 +237,31 @@ void PathPlanner::fill(const std::vector<double>& a, const std::vector<double>& 
     watch(contacts, {}, aloft_);
     watch(contacts, moving, low_);
     std::vector<Node> nodes{{0.0, a}}, finer;
-    for (int i = 1; i < points - 1; ++i) {
-        Node next{static_cast<double>(i) / (points - 1), {}};
-        node(next.share, nodes.back().q, false, next.q);
-        nodes.push_back(std::move(next));
-    }
+    bool passes = true;
+    const auto put = [&](double share, const std::vector<double>& last, bool halves,
+                         std::vector<Node>& to) {
+        Node next{share, {}};
+        node(share, last, halves, next.q);
+        // Where the solver is content, so is `check`.
+        if (refine && !moving.empty() && !first_.residuals.solved())
+            passes = overlap(next.q.data(), low_, nullptr) <= OVERLAP_LIMIT &&
+                     drift(contacts) <= DRIFT_LIMIT;
+        to.push_back(std::move(next));
+    };
+    for (int i = 1; i < points - 1 && passes; ++i)
+        put(static_cast<double>(i) / (points - 1), nodes.back().q, false, nodes);
     nodes.push_back({1.0, b});
     std::vector<double> middle;
-    for (int round = 0; refine && round < MAX_REFINEMENTS; ++round) {
+    for (int round = 0; refine && passes && round < MAX_REFINEMENTS; ++round) {
         finer.assign(1, nodes[0]);
-        for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
+        for (std::size_t i = 0; i + 1 < nodes.size() && passes; ++i) {
             between(nodes[i].q, nodes[i + 1].q, 0.5, middle);
             const double share = 0.5 * (nodes[i].share + nodes[i + 1].share);
             const bool inner = ENDS * std::min(share, 1.0 - share) >= 1.0;
             const double depth = overlap(middle.data(), inner ? aloft_ : low_, nullptr);
-            if (drift(contacts) > DRIFT_TOL || depth > OVERLAP_TOL) {
-                Node next{share, {}};
-                node(share, middle, true, next.q);
-                finer.push_back(std::move(next));
-            }
-            finer.push_back(nodes[i + 1]);
+            if (drift(contacts) > DRIFT_TOL || depth > OVERLAP_TOL)
+                put(share, middle, true, finer);
+            finer.push_back(passes ? nodes[i + 1] : nodes.back());
         }
         if (finer.size() == nodes.size()) break;
         nodes.swap(finer);
@@ -319,48 +325,49 @@ void PathPlanner::holding_torques(const std::vector<Contact>& contacts,
     held.torques(price, tau);
 }
 
-// Overlaps and contacts at all postures and half-way between, solver aside. Whether the
-// contacts hold the robot at the postures of a swing, too: those at its ends have been
-// looked at, and while weight shifts more contacts bear.
-void PathPlanner::check(const Transition& t, Path& out) {
-    const auto contacts = closed_contacts(t);
+// Overlaps and contacts at all postures of a phase and half-way between, solver aside.
+// Whether the contacts hold the robot at the postures of a swing, too: those at its ends
+// have been looked at, and while weight shifts more contacts bear.
+bool PathPlanner::check_phase(const Transition& t, int k, Path& out) {
+    const std::vector<Contact> contacts = closed_contacts(t)[k];
     std::vector<Contact> moving = t.rolling;
     if (t.makes) moving.push_back(t.made);
-    out.status = Path::Status::Solved;
-    out.depth = 0.0;
-    out.pair = -1;
-    out.weak.clear();
+    watch(contacts, moving, low_);
     std::vector<double> middle;
-    for (int k = 0; k < 3; ++k) {
-        const Postures& nodes = out.phases[k];
-        watch(contacts[k], moving, low_);
-        for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
-            between(nodes[i], nodes[i + 1], 0.5, middle);
-            const double* const looked_at[2] = {middle.data(), nodes[i + 1].data()};
-            for (const double* const q : looked_at) {
-                int pair = -1;
-                const double depth = overlap(q, low_, &pair);
-                if (depth > out.depth) {
-                    out.depth = depth;
-                    out.pair = pair;
-                    out.phase = k;
-                }
-                const double open = drift(contacts[k]);
-                if (open > DRIFT_LIMIT) {
-                    out.status = Path::Status::Opens;
-                    out.depth = open;
-                    out.phase = k;
-                    return;
-                }
+    const Postures& nodes = out.phases[k];
+    for (std::size_t i = 0; i + 1 < nodes.size(); ++i) {
+        between(nodes[i], nodes[i + 1], 0.5, middle);
+        const double* const looked_at[2] = {middle.data(), nodes[i + 1].data()};
+        for (const double* const q : looked_at) {
+            int pair = -1;
+            const double depth = overlap(q, low_, &pair);
+            if (depth > out.depth) {
+                out.depth = depth;
+                out.pair = pair;
+                out.phase = k;
             }
-            if (k == 1 && out.weak.empty() && !is_stable(t.held, nodes[i + 1].data()))
-                out.weak = nodes[i + 1];
+            const double open = drift(contacts);
+            if (open > DRIFT_LIMIT) {
+                out.status = Path::Status::Opens;
+                out.depth = open;
+                out.phase = k;
+                return false;
+            }
         }
+        if (k == 1 && out.weak.empty() && !is_stable(t.held, nodes[i + 1].data()))
+            out.weak = nodes[i + 1];
     }
     if (out.depth > OVERLAP_LIMIT)
         out.status = Path::Status::Overlaps;
     else if (!out.weak.empty())
         out.status = Path::Status::Weak;
+    return out.status == Path::Status::Solved;
+}
+
+void PathPlanner::check(const Transition& t, Path& out) {
+    out.forget();
+    for (int k = 0; k < 3; ++k)
+        if (!check_phase(t, k, out) && out.status == Path::Status::Opens) return;
 }
 
 Vec3 lean_direction(const Vec3& p1, const Vec3& p2, const Mat3& R_WB) {
@@ -434,11 +441,16 @@ void PathPlanner::stances(Transition& t, const double* shifted_hint,
 }
 
 void PathPlanner::plan(const Transition& t, Path& out) {
+    out.forget();
+    out.phases = {Postures{t.before, t.shifted}, {}, {t.touching, t.after}};
+    // The swing first, which is hardest: where it fails, nothing else is asked.
     swing(t, out);
+    if (!check_phase(t, 1, out)) return;
     const auto contacts = closed_contacts(t);
     bridge(t.before, t.shifted, contacts[0], out.phases[0]);
+    if (!check_phase(t, 0, out)) return;
     bridge(t.touching, t.after, contacts[2], out.phases[2]);
-    check(t, out);
+    check_phase(t, 2, out);
 }
 
 }  // namespace clamber

@@ -43,12 +43,21 @@ struct Path {
     double depth = 0.0;       // of the deepest overlap [m], or how far a contact opens
     int pair = -1;            // that overlaps
     std::vector<double> weak;  // (nq) the first posture of a swing that cannot be held
+
+    void forget() {  // what was wrong
+        status = Status::Solved;
+        phase = 0;
+        depth = 0.0;
+        pair = -1;
+        weak.clear();
+    }
 };
 
 class PathPlanner {
   public:
     explicit PathPlanner(const Model& model);
 
+    // Where there is none, the phases are as far as they were found.
     void plan(const Transition& t, Path& out);
     // Shift and touch between the postures before and after; broken contacts roll onto
     // their edges. The hints are postures that solve similar problems, or none.
@@ -90,6 +99,7 @@ class PathPlanner {
     void fill(const std::vector<double>& a, const std::vector<double>& b, int points,
               const std::vector<Contact>& contacts, const std::vector<Contact>& moving,
               bool refine, Fill node, Postures& out);
+    bool check_phase(const Transition& t, int k, Path& out);
     void watch(const std::vector<Contact>& contacts, const std::vector<Contact>& more,
                std::vector<unsigned char>& out) const;
     double overlap(const double* q, const std::vector<unsigned char>& watched, int* pair);
