@@ -457,8 +457,8 @@ class Workspace:
     ]:
         """The QP at q: H, c, closed rows and errors, kept rows, bounds, merit."""
 
-    def step(self, radius: float) -> np.ndarray:
-        """The solution of the QP that was built last."""
+    def step(self, problem: Problem, q: np.ndarray, radius: float) -> np.ndarray:
+        """The solution of the QP at q, with steps up to a share of the largest."""
 
     def is_stable(
         self, contacts: np.ndarray, contact_values: np.ndarray, q: np.ndarray

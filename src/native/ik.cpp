@@ -82,6 +82,14 @@ double Solver::look(const Problem& problem, const double* q, double reach) {
                   PENALTY * (rows.violation + beyond));
 }
 
+double Solver::begin(const Problem& problem, const double* q, double reach) {
+    rows.ask(problem);
+    forget_active();
+    const double merit = look(problem, q, reach);
+    linearise(problem, q);
+    return merit;
+}
+
 void Solver::linearise(const Problem& problem, const double* q) {
     rows.fill(kin);
     const int nv = model.nv;
@@ -227,9 +235,7 @@ Solver::Descent Solver::descend(const Problem& problem, const double* q, double 
 
 void Solver::solve(const Problem& problem, const double* q, int iterations,
                    double tolerance, Solution& out) {
-    rows.ask(problem);
-    forget_active();
-    const double start = look(problem, q, ACTIVE_RANGE);
+    const double start = begin(problem, q, ACTIVE_RANGE);
     if (!std::isfinite(start)) {  // nothing to descend from
         out.q.assign(q, q + model.nq);
         out.iterations = 0;
@@ -237,13 +243,10 @@ void Solver::solve(const Problem& problem, const double* q, int iterations,
         out.residuals = residuals(problem, q);
         return;
     }
-    linearise(problem, q);
     Descent found = descend(problem, q, start, iterations, tolerance, true, out.q);
     out.iterations = found.iterations;
     if (found.merit > start) {
-        forget_active();
-        look(problem, q, ACTIVE_RANGE);
-        linearise(problem, q);
+        begin(problem, q, ACTIVE_RANGE);
         found = descend(problem, q, start, iterations, tolerance, false, out.q);
         out.iterations += found.iterations;
     }

@@ -57,9 +57,10 @@ class Solver {
                     Solution& out);
     Residuals residuals(const Problem& problem, const double* q);
 
-    // No constraint is active in the next QP to begin with.
-    void forget_active();
-    // The merit at `q`, and the QP there.
+    // The merit at `q` of a problem that was not looked at before, and the QP there, of
+    // which no constraint is active to begin with.
+    double begin(const Problem& problem, const double* q, double reach);
+    // The same at other postures, from what was active.
     double look(const Problem& problem, const double* q, double reach);
     void linearise(const Problem& problem, const double* q);
     // Solve the QP of `linearise`, with steps up to a share of the largest.
@@ -85,6 +86,7 @@ class Solver {
     };
     double beyond_limits(std::size_t joint, const double* q) const;
     QP qp() const;  // of a step
+    void forget_active();
     void remember_active();
     Descent descend(const Problem& problem, const double* q, double merit, int iterations,
                     double tolerance, bool leap, std::vector<double>& x);

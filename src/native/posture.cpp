@@ -336,10 +336,7 @@ void bind_posture(nb::module_& m) {
              [](Workspace& w, const Problem& p, const Array1<>& q, double reach) {
                  const std::lock_guard lock(w.busy);
                  Solver& s = w.planner.solver;
-                 s.rows.ask(p);
-                 s.forget_active();
-                 const double merit = s.look(p, w.posture(q), reach);
-                 s.linearise(p, q.data());
+                 const double merit = s.begin(p, w.posture(q), reach);
                  const std::size_t nv = w.model->nv;
                  const auto stack = [nv](const std::vector<double>& J, std::size_t n) {
                      return own({J.begin(), J.begin() + n * nv}, {n, nv});
@@ -354,13 +351,18 @@ void bind_posture(nb::module_& m) {
              },
              "The QP at q: H, c, closed rows and errors, kept rows, bounds, merit.")
         .def("step",
-             [](Workspace& w, double radius) {
-                 const std::lock_guard lock(w.busy);
+             [](Workspace& w, const Problem& p, const Array1<>& q, double radius) {
                  std::vector<double> dq(w.model->nv);
-                 w.planner.solver.step(radius, dq.data());
+                 const double* from = w.posture(q);
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     w.planner.solver.begin(p, from, ACTIVE_RANGE);
+                     w.planner.solver.step(radius, dq.data());
+                 }
                  return own(std::move(dq));
              },
-             "The solution of the QP that was built last.")
+             "The solution of the QP at q, with steps up to a share of the largest.")
         .def("is_stable",
              [](Workspace& w, const Array2<int>& what, const Array2<>& where,
                 const Array1<>& q) {

@@ -315,4 +315,7 @@ def _keyframe_there(
     """A stable posture with the new contact at, or nearest to, a given place."""
     contact, solution = approach_contact(ik, task.held, wanted, q, step.seeds.touching)
     fixed = replace(task, new=(contact,), fixed=True)
-    return direct(ik, fixed, solution.q, options)
+    # Where it closes nowhere without load, it has been looked for from other postures:
+    # what closes under load alone is near where that ended.
+    closes = solution.status is Status.SOLVED
+    return direct(ik, fixed, solution.q, options, hard=closes)

@@ -264,8 +264,7 @@ class IK:
             q: (nq,).
             radius: Share of the largest step that this one may take.
         """
-        self.build(problem, q)
-        return self.core.step(radius)
+        return self.core.step(self._ask(problem), q, radius)
 
     def solve(
         self,

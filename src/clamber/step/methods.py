@@ -36,9 +36,22 @@ Method = Literal["direct", "lbfgs", "gradient"]
 
 
 def direct(
-    ik: IK, task: KeyframeTask, q: np.ndarray, options: KeyframeOptions
+    ik: IK,
+    task: KeyframeTask,
+    q: np.ndarray,
+    options: KeyframeOptions,
+    *,
+    hard: bool = True,
 ) -> Keyframe:
-    """Joints and contact positions in one constrained problem, from `q` (nq,)."""
+    """Joints and contact positions in one constrained problem.
+
+    Args:
+        ik: Workspace.
+        task: The stance.
+        q: (nq,) to start from.
+        options: Of the posture optimisation.
+        hard: Try from other postures where it stalls.
+    """
     before = _cost_at_references(ik, task, q, options)
     new = tuple(
         closed(ik.world, c)
@@ -51,7 +64,8 @@ def direct(
         )
         for c in task.new
     )
-    found = ik.solve_hard(keyframe_problem(ik.world, task, options, new), q)
+    problem = keyframe_problem(ik.world, task, options, new)
+    found = ik.solve_hard(problem, q) if hard else ik.solve(problem, q)
     return finish(
         ik,
         task,
