@@ -20,7 +20,6 @@ constexpr double ENDS = 5.0;  // a swing's first and last fifth: supports may be
 constexpr double REACH_ANGLE = 25.0 * M_PI / 180.0;  // phi of (4.27)
 constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
 constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
-constexpr double COM_WEIGHT = 0.3, ELLIPSE_WEIGHT = 2.0;
 
 // Contacts that stay closed in each phase: shift, swing, settle.
 std::array<std::vector<Contact>, 3> closed_contacts(const Transition& t) {

@@ -10,6 +10,8 @@ namespace clamber {
 
 constexpr double CLEARANCE = 0.010;  // [m] p_safe: between links, and links and the scene
 constexpr double FURTHER_CLEARANCE = 0.004;  // [m] a shin beside its knee
+constexpr double COM_WEIGHT = 0.3;       // of the middle of the polygon, while weight shifts
+constexpr double ELLIPSE_WEIGHT = 2.0;   // ... and of its ellipse (4.28)
 constexpr double ARC_WEIGHT = 40.0;      // of the arc, against posture 0.3 and constraints
 constexpr double DRIFT_LIMIT = 0.01;     // [m] of contacts, anywhere on the path
 constexpr double OVERLAP_LIMIT = 0.004;  // [m] of links, anywhere on the path

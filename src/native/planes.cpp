@@ -1,11 +1,11 @@
 // Planar regions of a surface that is given as many small elements and their neighbours.
+#include <algorithm>
 #include <cmath>
-#include <cstdint>
 #include <stdexcept>
 #include <vector>
 
 #include "bindings.h"
-#include "linalg.h"
+#include "planes.h"
 
 namespace clamber {
 
@@ -78,11 +78,50 @@ class Fit {
     double weight_ = 0.0;
 };
 
-// Labels of elements: those of one number are connected and lie within `reach` of one
-// plane, their normals within the angle of that cosine.
-//
-// corners: (n, k, 3) of each element. order: in which elements begin a region.
-nb::ndarray<nb::numpy, std::int32_t> grow_planes(
+}  // namespace
+
+void grow_planes(const Elements& of, double reach, double cosine, std::int32_t* label) {
+    const auto corner = [&](int i, int j) { return read3(of.corners + 3 * (of.k * i + j)); };
+    const auto normal = [&](int i) { return read3(of.normals + 3 * i); };
+    std::fill_n(label, of.n, -1);
+    std::vector<std::int32_t> queue;
+    std::int32_t regions = 0;
+    for (int o = 0; o < of.n; ++o) {
+        const std::int32_t seed = of.order[o];
+        if (label[seed] >= 0) continue;
+        Fit plane(corner(seed, 0), normal(seed));
+        const auto take = [&](std::int32_t i) {
+            label[i] = regions;
+            for (int j = 0; j < of.k; ++j)
+                plane.add(corner(i, j), normal(i), of.weights[i] / static_cast<double>(of.k));
+            queue.push_back(i);
+        };
+        queue.clear();
+        take(seed);
+        plane.refit();
+        std::size_t refit = 4;
+        for (std::size_t head = 0; head < queue.size(); ++head) {
+            for (int e = of.first[queue[head]]; e < of.first[queue[head] + 1]; ++e) {
+                const std::int32_t i = of.next[e];
+                if (label[i] >= 0 || !(dot(plane.normal(), normal(i)) >= cosine)) continue;
+                bool flat = true;
+                for (int j = 0; flat && j < of.k; ++j)
+                    flat = std::abs(plane.offset(corner(i, j))) <= reach;
+                if (!flat) continue;
+                take(i);
+                if (queue.size() >= refit) {
+                    plane.refit();
+                    refit += refit / 2;
+                }
+            }
+        }
+        ++regions;
+    }
+}
+
+namespace {
+
+nb::ndarray<nb::numpy, std::int32_t> planes_of(
     const Array3<>& corners, const Array2<>& normals, const Array1<>& weights,
     const Array1<std::int32_t>& first, const Array1<std::int32_t>& next,
     const Array1<std::int32_t>& order, double reach, double cosine) {
@@ -98,45 +137,13 @@ nb::ndarray<nb::numpy, std::int32_t> grow_planes(
             static_cast<std::size_t>(first(i + 1)) > next.shape(0) ||
             static_cast<std::size_t>(order(i)) >= n)
             throw std::invalid_argument("neighbours in order");
-    std::vector<std::int32_t> label(n, -1), queue;
+    const Elements of{static_cast<int>(n), static_cast<int>(k), corners.data(),
+                      normals.data(),      weights.data(),      first.data(),
+                      next.data(),         order.data()};
+    std::vector<std::int32_t> label(n);
     {
-        nb::gil_scoped_release free;
-        const auto corner = [&](std::size_t i, std::size_t j) {
-            return read3(corners.data() + 3 * (k * i + j));
-        };
-        const auto normal = [&](std::size_t i) { return read3(normals.data() + 3 * i); };
-        std::int32_t regions = 0;
-        for (std::size_t o = 0; o < n; ++o) {
-            const std::int32_t seed = order(o);
-            if (label[seed] >= 0) continue;
-            Fit plane(corner(seed, 0), normal(seed));
-            const auto take = [&](std::int32_t i) {
-                label[i] = regions;
-                for (std::size_t j = 0; j < k; ++j)
-                    plane.add(corner(i, j), normal(i), weights(i) / static_cast<double>(k));
-                queue.push_back(i);
-            };
-            queue.clear();
-            take(seed);
-            plane.refit();
-            std::size_t refit = 4;
-            for (std::size_t head = 0; head < queue.size(); ++head) {
-                for (std::int32_t e = first(queue[head]); e < first(queue[head] + 1); ++e) {
-                    const std::int32_t i = next(e);
-                    if (label[i] >= 0 || !(dot(plane.normal(), normal(i)) >= cosine)) continue;
-                    bool flat = true;
-                    for (std::size_t j = 0; flat && j < k; ++j)
-                        flat = std::abs(plane.offset(corner(i, j))) <= reach;
-                    if (!flat) continue;
-                    take(i);
-                    if (queue.size() >= refit) {
-                        plane.refit();
-                        refit += refit / 2;
-                    }
-                }
-            }
-            ++regions;
-        }
+        const nb::gil_scoped_release released;
+        grow_planes(of, reach, cosine, label.data());
     }
     return new_array(label.data(), {n});
 }
@@ -144,7 +151,7 @@ nb::ndarray<nb::numpy, std::int32_t> grow_planes(
 }  // namespace
 
 void bind_planes(nb::module_& m) {
-    m.def("grow_planes", grow_planes, nb::arg("corners"), nb::arg("normals"),
+    m.def("grow_planes", planes_of, nb::arg("corners"), nb::arg("normals"),
           nb::arg("weights"), nb::arg("first"), nb::arg("next"), nb::arg("order"),
           nb::arg("reach"), nb::arg("cosine"));
 }

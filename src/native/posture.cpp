@@ -193,6 +193,10 @@ void bind_posture(nb::module_& m) {
     m.attr("CLEARANCE") = CLEARANCE;
     m.attr("FURTHER_CLEARANCE") = FURTHER_CLEARANCE;
     m.attr("EFFORT_SHARE") = EFFORT_SHARE;
+    m.attr("MAX_ITERATIONS") = MAX_ITERATIONS;
+    m.attr("STEP_TOL") = STEP_TOL;
+    m.attr("COM_WEIGHT") = COM_WEIGHT;
+    m.attr("ELLIPSE_WEIGHT") = ELLIPSE_WEIGHT;
     m.attr("ARC_WEIGHT") = ARC_WEIGHT;
     m.attr("DRIFT_LIMIT") = DRIFT_LIMIT;
     m.attr("OVERLAP_LIMIT") = OVERLAP_LIMIT;

@@ -271,8 +271,8 @@ class IK:
         problem: PostureProblem,
         q: np.ndarray,
         *,
-        iterations: int = 60,
-        tolerance: float = 2e-3,
+        iterations: int = _core.MAX_ITERATIONS,
+        tolerance: float = _core.STEP_TOL,
     ) -> Solution:
         """Iterate from `q` until the step is below `tolerance`.
 

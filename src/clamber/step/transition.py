@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.contact.steps import MOVED, Seeds, Step
 from clamber.errors import Status
@@ -38,7 +39,9 @@ from clamber.step.tasks import (
 
 MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
 # that can be kept
-ELLIPSE_WEIGHT = 2.0  # soft task (4.28)
+# As the core asks for the postures of a change: of the polygon's middle, of (4.28).
+COM_WEIGHT: float = _core.COM_WEIGHT
+ELLIPSE_WEIGHT: float = _core.ELLIPSE_WEIGHT
 APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still give way
 
 
@@ -135,7 +138,7 @@ def balance_problem(
         balance_margin=margin,
         posture_weight=posture_weight,
         ellipse_weight=ELLIPSE_WEIGHT,
-        com_weight=0.3,
+        com_weight=COM_WEIGHT,
         base_weight=0.0,
     )
 

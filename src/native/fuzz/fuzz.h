@@ -95,6 +95,8 @@ void geometry(Random& random, Outcome& outcome);
 void proximity(Random& random, Outcome& outcome);
 void posture(Random& random, Outcome& outcome);
 void path(Random& random, Outcome& outcome);
+void timing(Random& random, Outcome& outcome);
+void planes(Random& random, Outcome& outcome);
 
 constexpr Part PARTS[] = {
     {"polygon", polygon},
@@ -104,6 +106,8 @@ constexpr Part PARTS[] = {
     {"proximity", proximity},
     {"posture", posture},
     {"path", path},
+    {"timing", timing},
+    {"planes", planes},
 };
 
 }  // namespace clamber::fuzz
