@@ -19,8 +19,8 @@ import clamber
 from clamber.execution.simulation import Rollout
 from clamber.planning.records import Plan
 from clamber.show.chart import COLOURS
+from clamber.show.framing import PRESETS
 from clamber.show.live import LAYERS, PERSON_LAYER
-from clamber.show.renderer import PRESETS
 from clamber.show.scene3d import BEFORE_EDITING
 from support.view import ON_SCREEN, SCENE, Opened, orange_in, served
 

@@ -19,8 +19,9 @@ import clamber
 from clamber.execution.terrain import fitted_box
 from clamber.model.kinematics import Kinematics
 from clamber.run.figures import finish_axes, save_plot
+from clamber.show.framing import seen_points, view_of
 from clamber.show.pictures import mark_keyframe
-from clamber.show.renderer import Camera, seen_points, view_of
+from clamber.show.renderer import Camera
 from clamber.step.polygon import support_ellipse, support_polygon
 from clamber.step.posture import STABILITY_WEIGHT
 

@@ -29,9 +29,10 @@ from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
 from clamber.run.figures import finish_axes
 from clamber.run.folder import save_plan, save_rollout, save_verdict
+from clamber.show.framing import seen_points, view_of
 from clamber.show.live import open_view
 from clamber.show.page import Page
-from clamber.show.renderer import Camera, seen_points, view_of
+from clamber.show.renderer import Camera
 from clamber.show.skeleton import skeleton_of
 
 TILE = (220, 220)  # [px] of a posture

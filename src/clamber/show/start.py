@@ -26,9 +26,9 @@ from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import new_run_folder, next_free_folder, save_proposal
+from clamber.show.framing import robot_corners
 from clamber.show.meshes import body_meshes, body_poses
 from clamber.show.page import Page, Work, paragraphs
-from clamber.show.renderer import robot_corners
 from clamber.show.scene3d import DEVIATION, PERSON_BOX, TRIANGLES, Bodies
 from clamber.show.track import EXECUTION, PLANNING
 from clamber.study.climb import Climb, ClimbResult, command_of, run_climb
