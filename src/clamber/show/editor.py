@@ -186,7 +186,7 @@ class Editor:
         page: Page,
         folder: Path,
         plan: Plan,
-        replaced: Callable[[Plan | None, Rollout | None], None],
+        replaced: Callable[[Plan | None, tuple[Rollout, Verdict] | None], None],
     ) -> None:
         """Fill the folder of the panel that is open.
 
@@ -398,7 +398,7 @@ class Editor:
         rollout = simulate(self._new, progress=self._work.report)
         verdict = judge(self._new, rollout)
         self._done = (rollout, verdict)
-        self._replaced(self._new, rollout)
+        self._replaced(self._new, self._done)
         if verdict.reached:
             return "Physics: success."
         return f"Physics: failed; not met: {verdict.failed()}."
