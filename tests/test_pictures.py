@@ -463,7 +463,7 @@ SCENES = {
             Box(
                 name="street",
                 size=np.array([30.0, 20.0, 0.4]),
-                position=np.array([15.3, 0.0, 0.2]),
+                centre=np.array([15.3, 0.0, 0.2]),
                 rotation=np.eye(3),
             ),
         ),

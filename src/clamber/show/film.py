@@ -96,7 +96,7 @@ class Person:
             shape
             for b in demo.scene.boxes
             for shape in block(
-                s * b.size, self._placed(b.position), R @ b.rotation, PERSON_BOX
+                s * b.size, self._placed(b.centre), R @ b.rotation, PERSON_BOX
             )
         ]
 

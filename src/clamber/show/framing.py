@@ -161,7 +161,7 @@ def obstacle_points(scene: Scene, points: np.ndarray, near: float = NEAR) -> np.
     room = near * float(np.ptp(points[:, 2])) * np.array([1.0, 1.0, 0.0])
     low, high = points.min(axis=0) - room, points.max(axis=0) + room
     found = [np.zeros((0, 3))]
-    boxes = (box_corners(b.size, b.position, b.rotation) for b in scene.boxes)
+    boxes = (box_corners(b.size, b.centre, b.rotation) for b in scene.boxes)
     for corners in (*boxes, *(p.copy() for m in scene.meshes for p in m.pieces)):
         if np.all(corners.max(axis=0)[:2] >= low[:2]) and np.all(
             corners.min(axis=0)[:2] <= high[:2]

@@ -101,7 +101,7 @@ def _figures(demo: Demonstration) -> bytes:
     fig = Figure(figsize=(9, 1.9), layout="constrained", dpi=DPI)
     for ax, t in zip(fig.subplots(1, len(times), sharey=True), times, strict=True):
         for box in demo.scene.boxes:
-            (x, _, z), (dx, _, dz) = box.position, box.size
+            (x, _, z), (dx, _, dz) = box.centre, box.size
             corner = (x - dx / 2, z - dz / 2)
             ax.add_patch(Rectangle(corner, dx, dz, color=BOX))
         points, seen = skeleton.at(float(t))

@@ -179,7 +179,7 @@ class Camera:
         self._edges = [
             edge
             for b in (boxes if len(boxes) <= MOST_EDGED else ())
-            for edge in _edges(b.size, b.position, b.rotation)
+            for edge in _edges(b.size, b.centre, b.rotation)
         ]
         for mesh in () if cutout else world.scene.meshes:
             for s in mesh.supports[:MOST_EDGED]:

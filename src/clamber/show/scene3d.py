@@ -328,7 +328,7 @@ class Figure:
                 color=PERSON_BOX,
                 dimensions=tuple(box.size),
                 wxyz=quat_from_matrix(box.rotation),
-                position=box.position,
+                position=box.centre,
             )
         none = np.zeros((1, 2, 3))
         self._bones = add.add_line_segments(

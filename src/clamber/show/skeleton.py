@@ -134,7 +134,7 @@ def to_the_right(
 
 def corners(scene: Scene) -> np.ndarray:
     """(8 n, 3) of the boxes [m]."""
-    corners = [box_corners(b.size, b.position, b.rotation) for b in scene.boxes]
+    corners = [box_corners(b.size, b.centre, b.rotation) for b in scene.boxes]
     return np.concatenate(corners) if corners else np.zeros((0, 3))
 
 
