@@ -204,7 +204,7 @@ def test_a_standing_knee_over_a_low_box_does_not_kneel():
     demo, _ = climb(noise=0.0, gaps=0)
     h = demo.point("LKnee")[0, 2] - 0.08  # just under the knee of the standing person
     boxes = (replace(demo.scene.boxes[0], size=np.array([3, 3, h])),)
-    boxes = (replace(boxes[0], position=np.array([1.45, 0, h / 2])),)
+    boxes = (replace(boxes[0], centre=np.array([1.45, 0, h / 2])),)
     still = replace(demo, position=np.repeat(demo.position[:1], len(demo.t), axis=0))
     found = detect_contacts(still, scene=Scene(boxes=boxes, start=np.zeros(3)))
     assert not [i for i in found.intervals if i.part.endswith("Knee")]
