@@ -27,6 +27,11 @@ SITE = $(shell $(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("pur
 N ?= 20000
 FRONT := build/front
 PIP = -m pip install --quiet --disable-pip-version-check
+# What the package needs, with an extra. Python compiles a file when it first needs it:
+# most files of the large packages are never read.
+NEEDS = import sys, tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	print(*p["dependencies"], *p["optional-dependencies"][sys.argv[1]], sep="\n")
+fetch = $(BIN)/python $(PIP) --no-compile -c constraints.txt -r <($(BIN)/python -c '$(NEEDS)' $(1))
 QUICK = not slow and not gpu and not network
 # One thread for each process: the matrices are small, and tests run side by side.
 export OMP_NUM_THREADS ?= 1
@@ -121,19 +126,25 @@ clean: ## remove what make has made, but no runs
 	rm -rf $(VENV) $(VENV3) build dist site .pytest_cache .ruff_cache
 
 # A stamp for each extra that is installed: nothing is fetched twice, so make works offline
-# afterwards. The package is there already, so pip only looks up what the extra asks for.
+# afterwards.
 $(VENV)/.has-%: pyproject.toml constraints.txt | $(VENV)/.has-core
-	@echo "installing clamber[$*] into $(VENV) ..."
-	@$(BIN)/python $(PIP) -c constraints.txt 'clamber[$*]'
+	@echo "installing what clamber[$*] needs into $(VENV) ..."
+	@$(call fetch,$*)
 	@touch $@
 
-# The package itself, from this folder. What was compiled stays in build/: after a change
-# only the files that changed are compiled again. The stamp bears the date of the beginning,
-# so that what is edited meanwhile counts as changed.
+# Fetched with the package, since nearly all that make does draws videos.
+$(VENV)/.has-video: $(VENV)/.has-core
+	@touch $@
+
+# The package itself, from this folder; what it needs is fetched while it is compiled.
+# What was compiled stays in build/: after a change only the files that changed are
+# compiled again. The stamp bears the date of the beginning, so that what is edited
+# meanwhile counts as changed.
 $(VENV)/.has-core: pyproject.toml constraints.txt $(NATIVE) | $(VENV)/.can-build
-	@echo "compiling the native core ..."
+	@echo "compiling the native core, and fetching NumPy, SciPy, MuJoCo ... meanwhile: about a minute ..."
 	@touch $@.begun
-	@$(BIN)/python $(PIP) --no-build-isolation -c constraints.txt -e .
+	@$(call fetch,video) & \
+		$(BIN)/python $(PIP) --no-build-isolation --no-deps -e .; wait $$!
 	@mv $@.begun $@
 
 # What compiles it: CMake and Ninja are the system's where it has them.

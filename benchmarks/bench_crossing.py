@@ -46,7 +46,7 @@ def scene_of(row: int) -> clamber.Scene:
     yaw = float(np.round(rng.uniform(-10.0, 10.0), 1))
     size = np.array([length, width, height])
     middle = np.array([FACE + length / 2, 0.0, height / 2])
-    box = clamber.Box(name="table", size=size, position=middle, rotation=np.eye(3))
+    box = clamber.Box(name="table", size=size, centre=middle, rotation=np.eye(3))
     return clamber.Scene(
         boxes=(box,),
         start=np.array([x, y, math.radians(yaw)]),

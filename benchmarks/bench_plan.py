@@ -53,7 +53,7 @@ def crossing() -> Callable[[], Plan]:
     box = Box(
         name="table",
         size=np.array([TABLE, 0.8, 0.27]),
-        position=np.array([0.23 + TABLE / 2, 0.0, 0.135]),
+        centre=np.array([0.23 + TABLE / 2, 0.0, 0.135]),
         rotation=np.eye(3),
     )
     goal = np.array([TABLE + 0.68, 0.0])

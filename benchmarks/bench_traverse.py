@@ -37,7 +37,7 @@ def measure(policy: Path, length: float) -> Row:
     """One plan, with all that this process has taken for it."""
     size = np.array([length, WIDTH, HEIGHT])
     middle = np.array([FACE + length / 2, 0.0, HEIGHT / 2])
-    box = clamber.Box(name="table", size=size, position=middle, rotation=np.eye(3))
+    box = clamber.Box(name="table", size=size, centre=middle, rotation=np.eye(3))
     goal = np.array([FACE + length + BEYOND, 0.0])
     scene = clamber.Scene(boxes=(box,), start=np.zeros(3), goal=goal)
     robot, general = clamber.load_robot("coman"), clamber.load_policy(policy)

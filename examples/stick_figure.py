@@ -30,7 +30,7 @@ VIEWS = {"side": (0.0, -90.0), "oblique": (20.0, -50.0)}  # elevation, azimuth [
 def _draw(ax, demo: Demonstration, k: int) -> None:
     for box in demo.scene.boxes:
         corners = {
-            c: box.position + box.rotation @ (np.array(c) * box.size / 2)
+            c: box.centre + box.rotation @ (np.array(c) * box.size / 2)
             for c in product((-1, 1), repeat=3)
         }
         for a, b in product(corners, repeat=2):

@@ -39,7 +39,7 @@ def stairs(steps: int, rise: float, tread: float) -> Scene:
         Box(
             name=f"s{i + 1}",
             size=np.array([tread, 0.8, rise * (i + 1)]),
-            position=np.array([0.23 + tread * (i + 0.5), 0.0, rise * (i + 1) / 2]),
+            centre=np.array([0.23 + tread * (i + 0.5), 0.0, rise * (i + 1) / 2]),
             rotation=np.eye(3),
         )
         for i in range(steps)

@@ -25,7 +25,7 @@ def obj(size, position, rpy, rng) -> str:
 
 def corners(box) -> np.ndarray:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    v = box.position + signs * box.size / 2 @ box.rotation.T
+    v = box.centre + signs * box.size / 2 @ box.rotation.T
     return v[np.lexsort(v.round(5).T)]
 
 
@@ -39,7 +39,7 @@ def test_a_tilted_box_is_found_from_its_vertices(tmp_path, rng, rpy):
     truth = Box(
         name="t",
         size=np.array(size),
-        position=np.array(position),
+        centre=np.array(position),
         rotation=matrix_from_rpy(rpy),
     )
     np.testing.assert_allclose(corners(found), corners(truth), atol=1e-5)
@@ -61,7 +61,7 @@ def test_boxes_and_ground_of_an_mjcf(tmp_path):
     assert scene.ground_friction == pytest.approx(0.6)
     assert scene.boxes[0].friction == pytest.approx(0.7)
     np.testing.assert_allclose(scene.boxes[0].size, [1.0, 1.2, 0.2])
-    np.testing.assert_allclose(scene.boxes[1].position, [2, 0, 0.2])
+    np.testing.assert_allclose(scene.boxes[1].centre, [2, 0, 0.2])
     turned = matrix_from_rpy([0, 0, 0.3])
     np.testing.assert_allclose(scene.boxes[0].rotation, turned, atol=1e-9)
 
@@ -151,7 +151,7 @@ def test_a_box_of_a_urdf_or_sdf_is_where_its_poses_put_it(
     truth = Box(
         name="t",
         size=np.array([1.0, 1.2, 0.2]),
-        position=np.array([0.8, 0.1, 0.3]),
+        centre=np.array([0.8, 0.1, 0.3]),
         rotation=matrix_from_rpy([0.0, 0.0, 0.3]),
     )
     np.testing.assert_allclose(corners(found), corners(truth), atol=1e-6)
@@ -240,7 +240,7 @@ def test_a_box_whose_faces_have_corners_of_their_own_is_one_box(tmp_path, split,
     (tmp_path / "b.obj").write_text("o table\n" + "\n".join(moved))
     found = only(tmp_path / "b.obj")
     assert found.name == "table"
-    np.testing.assert_allclose(found.position, [0.8, 0.0, 0.1], atol=1e-6)
+    np.testing.assert_allclose(found.centre, [0.8, 0.0, 0.1], atol=1e-6)
     np.testing.assert_allclose(sorted(found.size), [0.2, 1.0, 1.2], atol=1e-6)
 
 
@@ -260,7 +260,7 @@ def test_boxes_that_share_corners_stay_apart_where_faces_tell(tmp_path):
     (tmp_path / "b.obj").write_text(text)
     boxes = load_scene(tmp_path / "b.obj").boxes
     assert [b.name for b in boxes] == ["a", "b"]
-    np.testing.assert_allclose([b.position[0] for b in boxes], [0.5, 0.8], atol=1e-6)
+    np.testing.assert_allclose([b.centre[0] for b in boxes], [0.5, 0.8], atol=1e-6)
 
 
 def test_an_obj_with_y_up_is_asked_about_and_never_half_buried(tmp_path, rng):
@@ -270,9 +270,9 @@ def test_an_obj_with_y_up_is_asked_about_and_never_half_buried(tmp_path, rng):
         load_scene(tmp_path / "b.obj")
     (tmp_path / "s.yaml").write_text("boxes: b.obj\nup: y\n")
     found = only(tmp_path / "s.yaml")
-    np.testing.assert_allclose(found.position, [0.8, 0.0, 0.15], atol=1e-6)
+    np.testing.assert_allclose(found.centre, [0.8, 0.0, 0.15], atol=1e-6)
     (tmp_path / "s.yaml").write_text("boxes: b.obj\nup: z\n")
-    assert only(tmp_path / "s.yaml").position[2] == pytest.approx(0.0, abs=1e-6)
+    assert only(tmp_path / "s.yaml").centre[2] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_an_obj_of_another_shape_is_named(tmp_path):
@@ -297,7 +297,7 @@ def slope(pitch: float, friction: float = 0.8, x: float = 1.0) -> Box:
     return Box(
         name="slope",
         size=np.array([1.0, 1.0, 0.4]),
-        position=np.array([x, 0.0, 0.2]),
+        centre=np.array([x, 0.0, 0.2]),
         rotation=matrix_from_rpy([0.0, pitch, 0.0]),
         friction=friction,
     )
@@ -354,7 +354,7 @@ def test_a_slope_is_climbed_in_physics(coman, demo_sequence, rpy):
     box = Box(
         name="slope",
         size=size,
-        position=np.array([0.25, 0.0, 0.25]) - edge,
+        centre=np.array([0.25, 0.0, 0.25]) - edge,
         rotation=R,
     )
     made = plan(demo_sequence, coman, Scene(boxes=(box,), start=np.zeros(3)))

@@ -108,7 +108,7 @@ def test_objects_of_an_obj_give_boxes_their_names_and_others_numbers(tmp_path):
     boxes = read_obj(tmp_path / "b.obj")
     assert [b.name for b in boxes] == ["box1", "table"]
     np.testing.assert_allclose(np.sort(boxes[0].size[:2]), [1.0, 2.0], atol=1e-7)
-    np.testing.assert_allclose(boxes[0].position, [0, 0, 0.25], atol=1e-7)
+    np.testing.assert_allclose(boxes[0].centre, [0, 0, 0.25], atol=1e-7)
 
 
 def test_a_box_that_is_the_ground_lowers_the_world_to_its_top(write, tmp_path):
@@ -124,7 +124,7 @@ def test_a_box_that_is_the_ground_lowers_the_world_to_its_top(write, tmp_path):
     assert [b.name for b in demo.scene.boxes] == ["box1"]
     box = demo.scene.boxes[0]
     assert box.top.position[2] == pytest.approx(0.48, abs=1e-7)
-    assert box.position[2] - box.size[2] / 2 == pytest.approx(0.0, abs=1e-7)
+    assert box.centre[2] - box.size[2] / 2 == pytest.approx(0.0, abs=1e-7)
     assert demo.point("LFoot")[0, 2] == pytest.approx(0.08, abs=1e-7)
     assert floor.subject["knee_height"] == pytest.approx(0.533, abs=1e-6)
 

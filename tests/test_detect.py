@@ -129,7 +129,7 @@ def test_detection_does_not_depend_on_where_the_world_lies():
     angle, shift = 0.7, np.array([3.0, -2.0, 0.0])
     R = matrix_from_rpy([0, 0, angle])
     box = demo.scene.boxes[0]
-    there = replace(box, position=R @ box.position + shift, rotation=R @ box.rotation)
+    there = replace(box, centre=R @ box.centre + shift, rotation=R @ box.rotation)
     scene = Scene(boxes=(there,), start=np.array([3.0, -2.0, angle]))
     moved = replace(demo, position=demo.position @ R.T + shift, scene=scene)
     for a, b in zip(
@@ -169,7 +169,7 @@ def test_a_part_out_of_sight_is_not_said_to_be_in_contact():
 def seated(demo: Demonstration) -> Demonstration:
     """The person sitting on the near edge, shanks hanging down in front of it."""
     box = demo.scene.boxes[0]
-    edge, h = box.position[0] - box.size[0] / 2, box.size[2]
+    edge, h = box.centre[0] - box.size[0] / 2, box.size[2]
     place = {
         "Pelvis": (0.35, 0.0, 0.10), "Hip": (0.35, 0.10, 0.10),
         "Knee": (0.02, 0.10, 0.08), "Foot": (0.0, 0.10, 0.08 - 0.453),
@@ -204,7 +204,7 @@ def test_a_standing_knee_over_a_low_box_does_not_kneel():
     demo, _ = climb(noise=0.0, gaps=0)
     h = demo.point("LKnee")[0, 2] - 0.08  # just under the knee of the standing person
     boxes = (replace(demo.scene.boxes[0], size=np.array([3, 3, h])),)
-    boxes = (replace(boxes[0], position=np.array([1.45, 0, h / 2])),)
+    boxes = (replace(boxes[0], centre=np.array([1.45, 0, h / 2])),)
     still = replace(demo, position=np.repeat(demo.position[:1], len(demo.t), axis=0))
     found = detect_contacts(still, scene=Scene(boxes=boxes, start=np.zeros(3)))
     assert not [i for i in found.intervals if i.part.endswith("Knee")]
@@ -228,7 +228,7 @@ def test_a_person_of_another_size_makes_the_same_contacts(size):
     demo, truth = climb(noise=0.001, gaps=0)
     box = demo.scene.boxes[0]
     scene = Scene(
-        boxes=(replace(box, size=size * box.size, position=size * box.position),),
+        boxes=(replace(box, size=size * box.size, centre=size * box.centre),),
         start=demo.scene.start,
     )
     scaled = build_demonstration(

@@ -52,7 +52,7 @@ def test_by_default_nothing_differs():
     for a, b in zip(same.boxes, scene.boxes, strict=True):
         assert (a.name, a.friction, a.roughness) == (b.name, b.friction, b.roughness)
         assert np.array_equal(a.size, b.size)
-        assert np.allclose(a.position, b.position, rtol=0, atol=1e-15)
+        assert np.allclose(a.centre, b.centre, rtol=0, atol=1e-15)
         assert np.array_equal(a.rotation, b.rotation)
 
 

@@ -146,7 +146,7 @@ def test_a_turned_and_raised_box_survives_the_disk(
     box = Box(
         name="Cube.001",
         size=np.array([0.4, 0.5, 0.6]),
-        position=np.array([1.0, -0.2, 0.45]),
+        centre=np.array([1.0, -0.2, 0.45]),
         rotation=matrix_from_rpy(rpy),
         friction=0.35,
     )
@@ -157,11 +157,11 @@ def test_a_turned_and_raised_box_survives_the_disk(
     )
     save_sequence(replace(one_hand, scene=scene), tmp_path / "s.json")
     back = load_sequence(tmp_path / "s.json").scene
-    np.testing.assert_allclose(back.boxes[1].position, box.position, atol=1e-15)
+    np.testing.assert_allclose(back.boxes[1].centre, box.centre, atol=1e-15)
     np.testing.assert_allclose(back.boxes[1].rotation, box.rotation, atol=1e-15)
     exact = np.array_equal(back.boxes[1].rotation, box.rotation)
     assert exact or rpy[1] == np.pi / 2  # as a person wrote it
-    left = [".boxes.1.position", ".boxes.1.rotation"]
+    left = [".boxes.1.centre", ".boxes.1.rotation"]
     assert not [d for d in differences(back, scene) if d not in left]
 
 

@@ -342,7 +342,7 @@ def test_the_nearer_of_two_places_is_tried_first(ik, goal, tried):
 def test_places_beyond_reach_are_not_tried(coman, demo_sequence, tried):
     scene = Scene.from_height(0.275)
     away = np.array([2.5, 0.0, 0.0])
-    box = replace(scene.boxes[0], position=scene.boxes[0].position + away)
+    box = replace(scene.boxes[0], centre=scene.boxes[0].centre + away)
     ik = IK(build_world(coman, replace(scene, boxes=(box,))))
     ended = search(ik, retarget(demo_sequence, ik.world), tries=1000)
     assert why(ended) is Status.EXHAUSTED

@@ -64,7 +64,7 @@ def box(name: str, x: float, length: float, width=0.8, height=0.25) -> Box:
     return Box(
         name=name,
         size=np.array([length, width, height]),
-        position=np.array([x + length / 2, 0.0, height / 2]),
+        centre=np.array([x + length / 2, 0.0, height / 2]),
         rotation=np.eye(3),
     )
 
@@ -389,7 +389,7 @@ def test_it_turns_only_where_walls_leave_it_room():
     """A box of 2.4 m with a passage of 0.8 x 0.7 m in its middle, from x = 1.05 on."""
     wall = box("left", 1.05, 0.8, 0.1, 0.5)
     walls = [
-        replace(wall, name=name, position=np.array([1.45, y, 0.5]))
+        replace(wall, name=name, centre=np.array([1.45, y, 0.5]))
         for name, y in (("left", 0.40), ("right", -0.40))
     ]
     boxes, goal = (box("table", 0.25, 2.4, 1.2), *walls), np.array([3.0, 0.0])

@@ -54,7 +54,7 @@ def world() -> World:
         Box(
             name=name,
             size=np.array([0.8, 1.0, 0.3]),
-            position=np.array([x, 0.1, 0.1]),
+            centre=np.array([x, 0.1, 0.1]),
             rotation=matrix_from_rpy(rpy),
         )
         for name, x, rpy in (
@@ -1209,7 +1209,7 @@ def test_a_solved_posture_stays_solved_wherever_the_world_is_turned(rng):
     turned = Box(
         name="box",
         size=box.size,
-        position=R @ box.position + [*at, 0.0],
+        centre=R @ box.centre + [*at, 0.0],
         rotation=R,
     )
     scene = Scene(boxes=(turned,), start=np.array([*at, yaw]))

@@ -42,7 +42,7 @@ def scene() -> Scene:
     box = Box(
         name="table",
         size=np.array([LENGTH, 1.0, HEIGHT]),
-        position=np.array([0.4 + LENGTH / 2, 0.0, HEIGHT / 2]),
+        centre=np.array([0.4 + LENGTH / 2, 0.0, HEIGHT / 2]),
         rotation=np.eye(3),
     )
     return Scene(boxes=(box,), start=np.zeros(3))
@@ -512,7 +512,7 @@ def test_the_distributions_do_not_depend_on_where_the_world_lies():
     R = matrix_from_rpy([0, 0, yaw])
     a = posed()
     box = a.scene.boxes[0]
-    there = replace(box, position=R @ box.position + shift, rotation=R @ box.rotation)
+    there = replace(box, centre=R @ box.centre + shift, rotation=R @ box.rotation)
 
     def moved(stance: Stance) -> Stance:
         assert stance.pelvis is not None

@@ -356,7 +356,7 @@ def test_offset_and_rotation_move_the_person_and_the_boxes_drawn_with_it(tmp_pat
     expected = np.stack([0.1 - p[:, 1], 0.2 + p[:, 0], p[:, 2]], axis=1)
     np.testing.assert_allclose(back.point("Neck"), expected, atol=1e-9)
     (box,) = back.scene.boxes
-    np.testing.assert_allclose(box.position, [0.1, 1.2, 0.2], atol=1e-9)
+    np.testing.assert_allclose(box.centre, [0.1, 1.2, 0.2], atol=1e-9)
 
 
 # What is no recording at all.

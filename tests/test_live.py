@@ -145,10 +145,10 @@ def test_a_contact_that_is_moved_to_another_support_is_made_there(one_hand_plan:
 
 def test_contacts_go_with_a_box_that_is_moved(one_hand_plan: Plan):
     (box,) = one_hand_plan.world.scene.boxes
-    there = replace(box, position=box.position + 0.02 * np.eye(3)[0])
+    there = replace(box, centre=box.centre + 0.02 * np.eye(3)[0])
     again = editor.plan_edited(one_hand_plan, Edits(boxes={"box": there}))
     assert again.complete
-    assert again.world.scene.boxes[0].position[0] == pytest.approx(there.position[0])
+    assert again.world.scene.boxes[0].centre[0] == pytest.approx(there.centre[0])
     a, b = (
         next(c for c in p.sequence.stances[1].contacts if c.surface == "LHand")
         for p in (one_hand_plan, again)

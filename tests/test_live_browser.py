@@ -19,8 +19,8 @@ import clamber
 from clamber.execution.simulation import Rollout
 from clamber.planning.records import Plan
 from clamber.show.chart import COLOURS
+from clamber.show.framing import PRESETS
 from clamber.show.live import LAYERS, PERSON_LAYER
-from clamber.show.renderer import PRESETS
 from clamber.show.scene3d import BEFORE_EDITING
 from support.view import ON_SCREEN, SCENE, Opened, orange_in, served
 
@@ -400,9 +400,11 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
         assert abs(place[0] - start[0]) < 1e-3  # along the arrow alone
         view.click("Re-plan")
         tab.wait_for_selector("text=Planned to the last stance: 1 changes")
+        tab.wait_for_selector("text=edited plan: no verdict yet")
         view.until(lambda: view.orange() > ENOUGH, "the robot of the new plan")
         view.click("Simulate")
         tab.wait_for_selector("text=Physics: failed")
+        tab.wait_for_selector("text=edited plan: failed")
         view.until(lambda: view.orange() > ENOUGH, "the robot of the new run")
         view.click("Save")
         tab.wait_for_selector("text=Saved as")
@@ -412,6 +414,7 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
         np.testing.assert_allclose(hand.position[:2], place[:2], atol=0.005)
         assert (run / "edited" / "verdict.json").is_file()
         view.click("Undo all")
+        tab.wait_for_selector("text=edited plan", state="detached")
         tab.get_by_text("use LHand").first.click()
         tab.wait_for_selector("text=without LHand")
         view.click("Re-plan")

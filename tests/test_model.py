@@ -24,7 +24,7 @@ def scene_of(*rpys, start=(0.0, 0.0, 0.0), friction=0.8) -> Scene:
         Box(
             name=f"box{i}",
             size=np.array([0.6, 0.8, 0.3]),
-            position=np.array([0.6 - 1.0 * i, 0.1 * i, 0.15]),
+            centre=np.array([0.6 - 1.0 * i, 0.1 * i, 0.15]),
             rotation=matrix_from_rpy(rpy),
             friction=friction,
         )
@@ -109,7 +109,7 @@ def test_home_stands_at_the_start_with_its_soles_on_the_ground(start):
 @pytest.mark.parametrize("ahead", [0.0, 0.08])
 def test_knees_that_would_be_in_a_box_at_the_start_are_straighter(ahead):
     size, position = np.array([0.6, 0.8, 0.25]), np.array([0.53, 0.0, 0.125])
-    box = Box(name="table", size=size, position=position, rotation=np.eye(3))
+    box = Box(name="table", size=size, centre=position, rotation=np.eye(3))
     robot, start = load_robot("coman"), np.array([ahead, 0.0, 0.0])
     w = build_world(robot, Scene(boxes=(box,), start=start))
     knee = w.home[w.model.joint("LKneeSag").qposadr[0]]

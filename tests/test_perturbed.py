@@ -35,14 +35,14 @@ def scene() -> Scene:
             Box(
                 name="box",
                 size=np.array([1.0, 1.2, 0.3]),
-                position=np.array([0.8, 0.0, 0.15]),
+                centre=np.array([0.8, 0.0, 0.15]),
                 rotation=np.eye(3),
                 friction=0.7,
             ),
             Box(
                 name="step",
                 size=np.array([0.6, 0.45, 0.5]),
-                position=np.array([2.0, 0.5, 0.25]),
+                centre=np.array([2.0, 0.5, 0.25]),
                 rotation=matrix_from_rpy((0.0, 0.0, YAW)),
                 friction=0.6,
             ),
@@ -64,7 +64,7 @@ def uneven(world) -> World:
 
 def corner(box: Box, x: float, y: float, z: float) -> np.ndarray:
     """(3,) a point of a box in the world, its coordinates in half lengths."""
-    return box.position + box.rotation @ (0.5 * box.size * [x, y, z])
+    return box.centre + box.rotation @ (0.5 * box.size * [x, y, z])
 
 
 def geom_corner(world: World, name: str, x: float, y: float, z: float) -> np.ndarray:
@@ -156,7 +156,7 @@ def test_a_box_on_its_side_is_disturbed_as_it_lies(scene, turn):
     def corners(box: Box) -> np.ndarray:
         higher = perturbed_scene(replace(scene, boxes=(box,)), d).boxes[0]
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        points = higher.position + 0.5 * signs * higher.size @ higher.rotation.T
+        points = higher.centre + 0.5 * signs * higher.size @ higher.rotation.T
         return points[np.lexsort(points.round(6).T)]
 
     assert np.allclose(corners(lying), corners(upright), atol=1e-9)

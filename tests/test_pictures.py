@@ -23,7 +23,7 @@ from clamber.model.world import World, build_world
 from clamber.planning.records import Plan
 from clamber.recording.built_in import source_of
 from clamber.run import folder as run_files
-from clamber.show import film, marks, pictures, renderer
+from clamber.show import film, framing, marks, pictures, renderer
 from clamber.show.sample import force_by_contact, planned_forces
 from clamber.show.skeleton import skeleton_of
 from test_gait import POLICY
@@ -38,7 +38,7 @@ def opengl() -> None:
 
 
 def in_view(world: World, postures: np.ndarray) -> np.ndarray:
-    return renderer.seen_points(Kinematics(world), postures)
+    return framing.seen_points(Kinematics(world), postures)
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -55,10 +55,10 @@ def test_the_nearest_view_has_every_point_in_and_one_on_the_border(
     aspect: float, yaw: float, rng: np.random.Generator
 ):
     points = rng.uniform(-1, 1, (50, 3)) * [0.4, 0.3, 0.9] + [3.0, -2.0, 0.5]
-    view = renderer.frame_view(points, aspect, yaw=yaw)
+    view = framing.frame_view(points, aspect, yaw=yaw)
     size = (round(1000 * aspect), 1000)
     seen = view.project(points, size)
-    free = renderer.MARGIN / 2 * np.array(size)
+    free = framing.MARGIN / 2 * np.array(size)
     off = np.abs(seen - np.array(size) / 2) / (np.array(size) / 2 - free)
     assert off.max() == pytest.approx(1.0, abs=2e-3)
 
@@ -66,7 +66,7 @@ def test_the_nearest_view_has_every_point_in_and_one_on_the_border(
 def test_points_are_drawn_where_the_projection_says(plan: Plan, opengl: None):
     size = (320, 240)
     world = plan.world
-    view = renderer.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
+    view = framing.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
     kin = Kinematics(world)
     kin.update(world.home)
     with renderer.Camera(world, size) as camera:
@@ -84,11 +84,11 @@ def foot_of(plan: Plan) -> tuple[int, np.ndarray]:
 
 def test_the_whole_robot_is_in_view_in_every_posture(plan: Plan, rollout: Rollout):
     postures = rollout.qpos[::50]
-    view = renderer.view_of(plan.world, in_view(plan.world, postures), 4 / 3)
+    view = framing.view_of(plan.world, in_view(plan.world, postures), 4 / 3)
     kin = Kinematics(plan.world)
     for q in postures:
         kin.update(q)
-        seen = view.project(renderer.robot_corners(kin), (640, 480))
+        seen = view.project(framing.robot_corners(kin), (640, 480))
         assert np.all(seen > 0)
         assert np.all(seen < [640, 480])
 
@@ -96,16 +96,16 @@ def test_the_whole_robot_is_in_view_in_every_posture(plan: Plan, rollout: Rollou
 def test_all_of_a_near_box_is_seen_and_of_a_large_one_what_is_near():
     motion = np.array([[0.0, -0.3, 0.0], [0.5, 0.3, 1.0]])
     scene = Scene.from_height(0.3)
-    corners = renderer.obstacle_points(scene, motion)
-    near = renderer.NEAR * 1.0
+    corners = framing.obstacle_points(scene, motion)
+    near = framing.NEAR * 1.0
     assert corners[:, 0].min() == pytest.approx(0.23)
     assert corners[:, 0].max() == pytest.approx(0.5 + near)  # of 1.23
     np.testing.assert_allclose(sorted(set(corners[:, 2].round(9))), [0.0, 0.3])
     np.testing.assert_allclose(np.abs(corners[:, 1]), 0.6)
     far = motion + np.array([0.0, 5.0, 0.0])
-    assert len(renderer.obstacle_points(scene, far)) == 0
+    assert len(framing.obstacle_points(scene, far)) == 0
     nothing = Scene(start=np.zeros(3))
-    assert renderer.obstacle_points(nothing, motion).shape == (0, 3)
+    assert framing.obstacle_points(nothing, motion).shape == (0, 3)
 
 
 # Words.
@@ -176,7 +176,7 @@ def test_a_plan_alone_shows_its_keyframes_with_their_contacts(
 
 
 def test_the_picture_of_another_posture_differs(plan: Plan, opengl: None):
-    view = renderer.view_of(
+    view = framing.view_of(
         plan.world, in_view(plan.world, np.array([k.q for k in plan.keyframes])), 4 / 3
     )
     with renderer.Camera(plan.world, SIZE) as camera:
@@ -307,19 +307,19 @@ def run(whole: Path) -> Path:
     ],
 )
 def test_cameras_look_from_where_their_name_says(
-    camera: renderer.Preset, way: list[float]
+    camera: framing.Preset, way: list[float]
 ):
     """Of a robot that faces along x; turned with it."""
     points = np.random.default_rng(3).normal(size=(20, 3))
-    forward = renderer.frame_view(points, 1.5, camera=camera).axes[2]
+    forward = framing.frame_view(points, 1.5, camera=camera).axes[2]
     assert forward @ way > 0.9
-    turned = renderer.frame_view(points, 1.5, yaw=np.pi / 2, camera=camera).axes[2]
+    turned = framing.frame_view(points, 1.5, yaw=np.pi / 2, camera=camera).axes[2]
     np.testing.assert_allclose(turned, [-forward[1], forward[0], forward[2]], atol=1e-9)
 
 
 @pytest.mark.parametrize("camera", ["corner", "top"])
 def test_from_no_side_is_the_ground_white(
-    run: Path, tmp_path: Path, camera: renderer.Preset, opengl: None
+    run: Path, tmp_path: Path, camera: framing.Preset, opengl: None
 ):
     """Its chequers are to be seen."""
     made = pictures.render_frame(
@@ -333,7 +333,7 @@ def test_a_frame_shows_the_state_at_its_time(
 ):
     a = pictures.render_frame(run, 1.0, size=SIZE, marks="none", out=tmp_path / "a.png")
     size = SIZE[0] / SIZE[1]
-    view = renderer.view_of(rollout.world, in_view(rollout.world, rollout.qpos), size)
+    view = framing.view_of(rollout.world, in_view(rollout.world, rollout.qpos), size)
     row = int(np.argmin(np.abs(rollout.time - 1.0)))
     with renderer.Camera(rollout.world, SIZE) as camera:
         wanted = np.asarray(camera.shot(rollout.qpos[row], view)).astype(int)
@@ -388,7 +388,7 @@ def test_a_transparent_frame_has_the_robot_and_nothing_behind_it(
         rgba = np.asarray(picture).astype(int)
     alpha = rgba[..., 3]
     world = rollout.world
-    view = renderer.view_of(world, in_view(world, rollout.qpos), size[0] / size[1])
+    view = framing.view_of(world, in_view(world, rollout.qpos), size[0] / size[1])
     kin = Kinematics(world)
     kin.update(rollout.qpos[0])
     x, y = view.project(kin.com, size).round().astype(int)
@@ -463,7 +463,7 @@ SCENES = {
             Box(
                 name="street",
                 size=np.array([30.0, 20.0, 0.4]),
-                position=np.array([15.3, 0.0, 0.2]),
+                centre=np.array([15.3, 0.0, 0.2]),
                 rotation=np.eye(3),
             ),
         ),
@@ -482,7 +482,7 @@ def test_the_whole_robot_is_in_the_picture_and_fills_its_share(
     ways[:, 0] += np.linspace(0.0, 1.5, 3)
     ways[:, 2] += np.linspace(0.0, 0.4, 3)
     size = (320, 180)
-    view = renderer.view_of(world, in_view(world, ways), size[0] / size[1])
+    view = framing.view_of(world, in_view(world, ways), size[0] / size[1])
     with renderer.Camera(world, size) as camera:
         for q in ways:
             found = np.asarray(camera.cutout(q, view))
@@ -491,7 +491,7 @@ def test_the_whole_robot_is_in_the_picture_and_fills_its_share(
             rows, columns = np.nonzero(accent)
             kin = Kinematics(world)
             kin.update(q)
-            at = view.project(renderer.robot_corners(kin), size)
+            at = view.project(framing.robot_corners(kin), size)
             assert at.min() > 0
             assert np.all(at.max(axis=0) < size)
             assert np.all(at.min(axis=0)[1] - 2 <= rows.min())
@@ -559,15 +559,43 @@ def _silent(stage: str, share: float, note: str) -> None:
 
 def test_shadows_are_soft_and_lie_on_the_ground(plan: Plan, opengl: None):
     world, size = plan.world, (320, 240)
-    view = renderer.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
+    view = framing.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
     with renderer.Camera(world, size) as camera:
         shaded = np.asarray(camera.shot(world.home, view)).astype(int)
-        plain = np.asarray(camera._drawn(camera._frame).resize(size)).astype(int)
+        plain = camera._drawn(camera._frame, (0, 0, *size)).resize(size)
+        plain = np.asarray(plain).astype(int)
     darker = 1.0 - shaded.sum(axis=2) / np.maximum(plain.sum(axis=2), 1)
     assert darker.max() > 0.25
     assert np.mean(darker > 0.25) > 0.005
     edge = (darker > 0.04) & (darker < 0.2)
     assert edge.sum() > 0.1 * (darker > 0.25).sum()  # not a step
+
+
+@pytest.mark.parametrize("robot", ["coman", "coman29"])
+@pytest.mark.parametrize("size", [(640, 360), (322, 182)])
+def test_what_is_drawn_over_what_stands_still_is_the_whole_picture(
+    robot: str, size: tuple[int, int], opengl: None
+):
+    """Shadows that move are moved, those that stay are kept."""
+    scene = clamber.Scene.from_height(0.3)
+    world = build_world(clamber.load_robot(robot), scene)
+    ways = np.tile(world.home, (3, 1))
+    ways[:, 0] += np.linspace(0.0, 1.0, 3)
+    ways[:, 2] += np.linspace(0.0, 0.5, 3)
+    seen = in_view(world, ways)
+    at = seen.max(axis=0)
+    view = framing.view_of(world, seen, size[0] / size[1])
+    post = renderer.block(np.full(3, 0.2), at, np.eye(3), (0.2, 0.4, 0.9, 1.0))
+    ball = renderer.ball(at - [0.0, 0.4, 0.3], 0.1, (0.9, 0.4, 0.2, 1.0))
+    with renderer.Camera(world, size, fine=False) as camera:
+        still = camera.still(view, post)
+        for q in ways:
+            whole = np.asarray(camera.shot(q, view, [ball, *post])).astype(int)
+            over = np.asarray(camera.shot(q, view, [ball], still)).astype(int)
+            assert np.mean(np.abs(whole - over).max(axis=2) > 6) < 1e-3
+            part = camera._covered(view)
+            is_whole = part == (0, 0, *size)
+            assert is_whole == (size != (640, 360))  # of odd pixels there is no part
 
 
 def test_no_phase_of_a_contact_is_red():

@@ -51,7 +51,7 @@ def at_distance(gap: float, height: float = 0.275) -> Scene:
     box = Box(
         name="table",
         size=np.array([1.0, 1.2, height]),
-        position=np.array([gap + 0.5, 0.0, height / 2]),
+        centre=np.array([gap + 0.5, 0.0, height / 2]),
         rotation=np.eye(3),
     )
     return Scene(boxes=(box,), start=np.zeros(3))
@@ -115,7 +115,7 @@ def test_the_sequence_is_brought_to_the_robots_scale(demo_plan, demo_sequence):
     def reach(sequence) -> float:
         """How far behind the near edge the hands go."""
         box = sequence.scene.boxes[0]
-        edge = box.position[0] - box.size[0] / 2
+        edge = box.centre[0] - box.size[0] / 2
         hands = [
             c.position[0]
             for stance in sequence.stances
@@ -399,7 +399,7 @@ def test_the_judge_refuses_runs_that_were_tampered_with(
 
 def test_a_box_where_the_robot_stands_is_named(coman, demo_sequence):
     box = Scene.from_height(0.3).boxes[0]
-    inside = replace(box, position=box.position - [0.4, 0.0, 0.0])
+    inside = replace(box, centre=box.centre - [0.4, 0.0, 0.0])
     scene = Scene(boxes=(inside,), start=np.zeros(3))
     with pytest.raises(InputError, match=r"scene.start.*box") as error:
         plan(demo_sequence, coman, scene)

@@ -93,7 +93,7 @@ def test_the_demonstration_is_drawn_with_what_was_found(tmp_path: Path):
     box = Box(
         name="table",
         size=np.ones(3),
-        position=np.array([1, 0, 0.0]),
+        centre=np.array([1, 0, 0.0]),
         rotation=np.eye(3),
     )
     scene = Scene(boxes=(box,), start=np.zeros(3))

@@ -32,7 +32,7 @@ def table(yaw: float = 0.0, centre=(1.0, 0.0)) -> Box:
     return Box(
         name="table",
         size=np.array([1.6, 0.9, 0.6]),
-        position=np.array([*centre, 0.3]),
+        centre=np.array([*centre, 0.3]),
         rotation=matrix_from_rpy([0.0, 0.0, yaw]),
     )
 

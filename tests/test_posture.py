@@ -258,7 +258,7 @@ def askew() -> tuple[IK, KeyframeTask]:
     box = Box(
         name="box",
         size=np.array([1.0, 1.2, 0.25]),
-        position=np.array([0.85, 0.0, 0.14]),
+        centre=np.array([0.85, 0.0, 0.14]),
         rotation=matrix_from_rpy([0.06, -0.05, 0.5]),
     )
     ik = IK(build_world(load_robot("coman"), Scene(boxes=(box,), start=np.zeros(3))))
@@ -391,7 +391,7 @@ def test_a_box_that_is_too_far_is_unreachable():
     box = Box(
         name="box",
         size=np.array([1.0, 1.2, 0.275]),
-        position=np.array([2.0, 0.0, 0.1375]),
+        centre=np.array([2.0, 0.0, 0.1375]),
         rotation=np.eye(3),
     )
     far = IK(build_world(load_robot("coman"), Scene(boxes=(box,), start=np.zeros(3))))

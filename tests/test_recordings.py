@@ -592,7 +592,7 @@ def test_a_floor_and_a_box_that_are_off_are_put_right(floor, top):
     assert level["table"] == pytest.approx(0.11 - ideal["Knee"], abs=2e-3)
 
     box = demo.scene.boxes[0]
-    wrong = replace(box, size=box.size + top * UP, position=box.position + top / 2 * UP)
+    wrong = replace(box, size=box.size + top * UP, centre=box.centre + top / 2 * UP)
     off = replace(
         demo, position=demo.position + floor * UP,
         scene=replace(demo.scene, boxes=(wrong,)),
@@ -603,7 +603,7 @@ def test_a_floor_and_a_box_that_are_off_are_put_right(floor, top):
         np.testing.assert_allclose(right.point(name), demo.point(name), atol=3e-3)
     table = right.scene.boxes[0]
     assert table.size[2] == pytest.approx(box.size[2], abs=5e-3)
-    assert table.position[2] - table.size[2] / 2 == pytest.approx(0.0, abs=1e-9)
+    assert table.centre[2] - table.size[2] / 2 == pytest.approx(0.0, abs=1e-9)
     assert any(f"ground {1000 * floor:+.0f} mm" in n for n in right.notes) or floor == 0
     check_contacts(right, truth)
 
@@ -612,7 +612,7 @@ def test_a_thin_box_is_never_turned_inside_out():
     demo, _ = climb()
     box = demo.scene.boxes[0]
     size, lower = np.array([*box.size[:2], 0.02]), (box.size[2] / 2 - 0.01) * UP
-    thin = replace(box, size=size, position=box.position + lower)
+    thin = replace(box, size=size, centre=box.centre + lower)
     offsets = {**demo.offsets, "Knee": demo.offsets["Knee"] + 0.05}
     scene = replace(demo.scene, boxes=(thin,))
     fitted = fit_levels(replace(demo, scene=scene, offsets=offsets)).scene.boxes[0]
@@ -621,10 +621,10 @@ def test_a_thin_box_is_never_turned_inside_out():
 
 def test_what_nobody_rests_on_is_not_fitted():
     demo, _ = climb()
-    far = replace(demo.scene.boxes[0], name="far", position=np.array([9.0, 0.0, 0.25]))
+    far = replace(demo.scene.boxes[0], name="far", centre=np.array([9.0, 0.0, 0.25]))
     scene = replace(demo.scene, boxes=(*demo.scene.boxes, far))
     fitted = fit_levels(replace(demo, scene=scene))
-    assert fitted.scene.boxes[1].position[2] == 0.25
+    assert fitted.scene.boxes[1].centre[2] == 0.25
     assert "not fitted: far, nothing rests on it" in fitted.notes
     walked = replace(demo, position=demo.position + 0.5 * UP)
     assert not find_levels(replace(walked, scene=Scene(start=np.zeros(3))))

@@ -25,7 +25,7 @@ def box(name: str, x: float, size=(0.6, 0.8, 0.25), y=0.0, yaw=0.0, below=0.0) -
     return Box(
         name=name,
         size=np.array(size, float),
-        position=np.array([x, y, below + size[2] / 2]),
+        centre=np.array([x, y, below + size[2] / 2]),
         rotation=matrix_from_rpy([0.0, 0.0, yaw]),
     )
 
@@ -71,7 +71,7 @@ def test_a_turned_box_is_entered_square_to_its_edge_away_from_corners(yaw):
     b = box("a", 0.8, yaw=yaw)
     edge = find_platforms(scene(b), FAR)[0].entry
     np.testing.assert_allclose(edge.inward, [np.cos(yaw), np.sin(yaw)], atol=1e-12)
-    local = b.rotation[:2, :2].T @ (edge.point[:2] - b.position[:2])
+    local = b.rotation[:2, :2].T @ (edge.point[:2] - b.centre[:2])
     np.testing.assert_allclose(local[0], -0.3, atol=1e-12)
     assert abs(local[1]) <= 0.4 - BESIDE + 1e-12
 

@@ -34,7 +34,7 @@ def box(yaw=0.0, size=(1.0, 1.2, 0.5), at=(0.9, 0.0), name="table", rp=(0.0, 0.0
     return Box(
         name=name,
         size=np.array(size),
-        position=np.array([*at, size[2] / 2]),
+        centre=np.array([*at, size[2] / 2]),
         rotation=matrix_from_rpy([*rp, yaw]),
     )
 
@@ -161,7 +161,7 @@ def test_where_the_recording_lay_and_looked_does_not_matter(world, seed):
     R = matrix_from_rpy([0.0, 0.0, yaw])
     there = climb()
     b = there.scene.boxes[0]
-    moved = replace(b, position=R @ b.position + shift, rotation=R @ b.rotation)
+    moved = replace(b, centre=R @ b.centre + shift, rotation=R @ b.rotation)
     start = R @ np.array([*there.scene.start[:2], 0.0]) + shift
     stances = tuple(
         Stance(
@@ -200,7 +200,7 @@ def test_the_robots_contacts_turn_with_its_scene(yaw):
     R, at = matrix_from_rpy([0.0, 0.0, yaw]), np.array([1.0, -2.0, 0.0])
     obstacle = box(0.0, (1.0, 1.2, 0.3), (0.73, 0.0), "crate")
     moved = replace(
-        obstacle, position=R @ obstacle.position + at, rotation=R @ obstacle.rotation
+        obstacle, centre=R @ obstacle.centre + at, rotation=R @ obstacle.rotation
     )
     robot = load_robot("coman")
     plain = retarget(climb(), build_world(robot, scene_of(obstacle)))

@@ -23,7 +23,7 @@ def box_at(rpy=(0.0, 0.0, 0.0), size=(0.8, 0.5, 0.3), position=(0.4, -0.2, 0.6))
     return Box(
         name="box",
         size=np.array(size),
-        position=np.array(position),
+        centre=np.array(position),
         rotation=matrix_from_rpy(rpy),
     )
 
@@ -31,7 +31,7 @@ def box_at(rpy=(0.0, 0.0, 0.0), size=(0.8, 0.5, 0.3), position=(0.4, -0.2, 0.6))
 def corners_of(box: Box) -> np.ndarray:
     """(8, 3) corners in the world, written out."""
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    return box.position + (signs * box.size / 2) @ box.rotation.T
+    return box.centre + (signs * box.size / 2) @ box.rotation.T
 
 
 def support_of(polygon: np.ndarray, rpy=(0.0, 0.0, 0.0)) -> Support:
@@ -112,7 +112,7 @@ def test_the_top_is_the_highest_face_and_points_out(rpy):
     heights = top.height(corners)
     assert heights.max() < 1e-12
     assert np.sum(heights > -1e-12) == 4
-    assert top.normal @ (top.position - box.position) > 0
+    assert top.normal @ (top.position - box.centre) > 0
     # No other face has a normal as upright.
     assert top.normal[2] == pytest.approx(np.abs(box.rotation[2]).max())
     np.testing.assert_allclose(vertices.mean(axis=0), top.position, atol=1e-12)
@@ -123,7 +123,7 @@ def test_half_planes_say_what_the_box_frame_says(rpy, rng):
     box = box_at(rpy)
     top = box.top
     local = rng.uniform(-0.6, 0.6, (400, 3))
-    points = box.position + local @ box.rotation.T
+    points = box.centre + local @ box.rotation.T
     truth = np.all(np.abs(local[:, :2]) <= box.size[:2] / 2, axis=1)
     np.testing.assert_array_equal(top.inside(points), truth)
     assert 0.1 < truth.mean() < 0.9
@@ -180,14 +180,14 @@ def test_a_polygon_that_is_not_convex_and_ccw_is_refused(polygon):
 
 def test_arrays_are_copies_and_read_only():
     size = np.array([1.0, 1.0, 1.0])
-    box = Box(name="b", size=size, position=np.zeros(3), rotation=np.eye(3))
+    box = Box(name="b", size=size, centre=np.zeros(3), rotation=np.eye(3))
     size[0] = 9.0
     assert box.size[0] == 1.0
-    for a in (box.size, box.position, box.rotation, box.top.polygon, box.top.position):
+    for a in (box.size, box.centre, box.rotation, box.top.polygon, box.top.position):
         with pytest.raises(ValueError, match="read-only"):
             a[0] = 2.0
     with pytest.raises(ValueError, match="expected"):
-        Box(name="b", size=np.ones(2), position=np.zeros(3), rotation=np.eye(3))
+        Box(name="b", size=np.ones(2), centre=np.zeros(3), rotation=np.eye(3))
 
 
 def test_supports_come_ground_first_and_are_found_by_name():
@@ -286,7 +286,7 @@ def test_of_two_edges_at_a_corner_that_is_taken_which_faces_the_place():
 
 def test_the_support_below_is_the_highest_that_is_there(rng):
     low = box_at((0.1, 0.0, 0.3), size=(1.0, 1.0, 0.3), position=(0.0, 0.0, 0.15))
-    shelf = replace(low, name="shelf", position=np.array([0.4, 0.0, 0.8]))
+    shelf = replace(low, name="shelf", centre=np.array([0.4, 0.0, 0.8]))
     scene = Scene(boxes=(low, shelf), start=np.zeros(3))
     for p in rng.uniform([-1, -1, 0], [1, 1, 1.2], (200, 3)):
         best = GROUND, 0.0
@@ -326,8 +326,8 @@ goal: [1.6, 0.4, 0.5]
     )
     table, shelf = scene.boxes
     assert (scene.ground.friction, table.friction, shelf.friction) == (0.5, 0.6, 0.8)
-    np.testing.assert_allclose(table.position, [0.705, 0.1, 0.1375])  # on the ground
-    np.testing.assert_allclose(shelf.position, [2.0, 0.0, 0.55])  # bottom face at 0.5
+    np.testing.assert_allclose(table.centre, [0.705, 0.1, 0.1375])  # on the ground
+    np.testing.assert_allclose(shelf.centre, [2.0, 0.0, 0.55])  # bottom face at 0.5
     np.testing.assert_allclose(table.rotation, matrix_from_rpy([0.0, 0.0, 0.3]))
     np.testing.assert_array_equal(scene.start, [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(scene.goal, [1.6, 0.4, 0.5])
@@ -357,7 +357,7 @@ def test_roughness_survives_the_fields_of_a_written_scene(tmp_path):
     plain = yaml.safe_dump(json.loads(json.dumps(fields, default=np.ndarray.tolist)))
     again = load_scene(written(tmp_path, plain))
     assert again.boxes[0].roughness == 0.017
-    np.testing.assert_allclose(again.boxes[0].position, box.position)
+    np.testing.assert_allclose(again.boxes[0].centre, box.centre)
     np.testing.assert_allclose(again.boxes[0].rotation, box.rotation, atol=1e-12)
 
 

@@ -46,7 +46,7 @@ def ik(coman):
     far = Box(
         name="far",
         size=np.array([1.0, 1.2, 0.4]),
-        position=np.array([4.0, 0.0, 0.2]),
+        centre=np.array([4.0, 0.0, 0.2]),
         rotation=np.eye(3),
     )
     scene = Scene.from_height(HEIGHT)

@@ -79,7 +79,7 @@ def narrow() -> Climber:
 def heights(scene: Scene, *z: float) -> Scene:
     """The same boxes, that high."""
     boxes = (
-        replace(b, size=[*b.size[:2], h], position=[*b.position[:2], h / 2])
+        replace(b, size=[*b.size[:2], h], centre=[*b.centre[:2], h / 2])
         for b, h in zip(scene.boxes, z, strict=True)
     )
     return replace(scene, boxes=tuple(boxes))
@@ -211,7 +211,7 @@ def test_the_way_up_ends_with_all_on_the_last_tread(steps, tread, yaw):
     """Only forwards, soles on treads, hands ahead of the feet, wherever it faces."""
     turn = matrix_from_rpy(np.array([0.0, 0.0, yaw]))
     flat = stairs(steps, 0.15, tread)
-    turned = (replace(b, position=turn @ b.position, rotation=turn) for b in flat.boxes)
+    turned = (replace(b, centre=turn @ b.centre, rotation=turn) for b in flat.boxes)
     goal = turn[:2, :2] @ flat.goal
     start = np.array([0.0, 0, yaw])
     flight = Climber(Scene(boxes=tuple(turned), start=start, goal=goal))

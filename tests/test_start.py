@@ -36,7 +36,7 @@ OFFSETS = [(0.0, 0.0, 0.02), (0.0, 0.0, -0.03), (0.012, -0.01, 0.015)]
 def moved(scene: Scene, *offset: float, roughness: float = 0.0) -> Scene:
     """The box elsewhere."""
     box = scene.boxes[0]
-    box = replace(box, position=box.position + offset, roughness=roughness)
+    box = replace(box, centre=box.centre + offset, roughness=roughness)
     return replace(scene, boxes=(box,))
 
 
@@ -484,7 +484,7 @@ def test_stopped_in_the_middle_a_climb_goes_on_to_the_top_of_a_box_that_moved(
     assert np.array_equal(rollout.qpos[0], q)  # it starts where it was
     verdict = judge(rest, rollout)
     assert verdict.reached, verdict
-    near = scene.boxes[0].position - scene.boxes[0].size / 2
+    near = scene.boxes[0].centre - scene.boxes[0].size / 2
     for c in rest.keyframes[-1].stance:
         assert c.support == "box"
         assert np.all(c.position[:2] > near[:2])

@@ -86,7 +86,7 @@ def test_nothing_goes_through_the_box_or_the_ground(name):
     for a, b in bones:
         for share in np.linspace(0.0, 1.0, 9):
             p = (1 - share) * demo.point(a) + share * demo.point(b)
-            depth = np.min(box.size / 2 - np.abs(p - box.position), axis=1)
+            depth = np.min(box.size / 2 - np.abs(p - box.centre), axis=1)
             assert depth.max() < -0.01, (a, b, demo.t[np.argmax(depth)])
             assert p[:, 2].min() > 0.03
 
@@ -125,9 +125,9 @@ def test_the_person_turns_midway_and_stands_behind_the_table_in_the_end(name):
     faces = np.abs(np.unwrap(np.arctan2(-left[:, 0], left[:, 1])))
     assert faces[[0, -1]] == pytest.approx([0.0, np.pi], abs=0.05)
     quarter = pelvis[np.argmin(np.abs(faces - np.pi / 2)), 0]
-    assert abs(quarter - box.position[0]) < 0.1 * box.size[0]
+    assert abs(quarter - box.centre[0]) < 0.1 * box.size[0]
     assert pelvis[[0, -1], 2] == pytest.approx(0.9, abs=0.02)
-    assert 0.4 < pelvis[-1, 0] - box.position[0] - box.size[0] / 2 < 1.3
+    assert 0.4 < pelvis[-1, 0] - box.centre[0] - box.size[0] / 2 < 1.3
 
 
 @each_crossing
@@ -187,7 +187,7 @@ def test_the_shipped_demonstrations_are_what_their_generators_make(name):
     np.testing.assert_array_equal(shipped.t, made.t)
     assert (shipped.names, shipped.gaps) == (made.names, made.gaps)
     for a, b in zip(shipped.scene.boxes, made.scene.boxes, strict=True):
-        np.testing.assert_array_equal([a.size, a.position], [b.size, b.position])
+        np.testing.assert_array_equal([a.size, a.centre], [b.size, b.centre])
     assert shipped.synthetic
     assert shipped.source == made.source
     assert "synthetic" in shipped.source

@@ -29,7 +29,7 @@ def box_at(rpy=(0.0, 0.0, 0.0), **changes) -> Box:
     fields = {
         "name": "box",
         "size": np.array([1.0, 1.2, 0.3]),
-        "position": np.array([0.8, 0.1, 0.15]),
+        "centre": np.array([0.8, 0.1, 0.15]),
         "rotation": matrix_from_rpy(rpy),
     }
     return Box(**(fields | changes))
@@ -132,10 +132,10 @@ def test_the_fit_does_not_depend_on_the_frame_of_the_world(
     box = box_at()
     z = 0.01 + spread @ [0.05, 0.02] + rng.normal(0.0, spread_of_z, len(spread))
     R, t = matrix_from_rpy(rpy), np.array([0.7, -1.3, 0.2])
-    moved = replace(box, rotation=R @ box.rotation, position=R @ box.position + t)
+    moved = replace(box, rotation=R @ box.rotation, centre=R @ box.centre + t)
     points = on_top(box, np.column_stack([spread, z]))
     here, there = fitted_box(box, points), fitted_box(moved, points @ R.T + t)
-    assert np.allclose(there.position, R @ here.position + t, atol=1e-12)
+    assert np.allclose(there.centre, R @ here.centre + t, atol=1e-12)
     assert np.allclose(there.rotation, R @ here.rotation, atol=1e-12)
     assert there.roughness == pytest.approx(here.roughness)
 
@@ -160,7 +160,7 @@ def test_near_contacts_that_contradict_make_a_rough_top_not_a_steep_one():
     points = on_top(box, [[-0.35, -0.05, 0.015], [-0.35, 0.05, -0.015]])
     after = fitted_box(box, points)
     assert after.roughness > CAUTION
-    steep = posterior(points[:, :2] - box.position[:2], [0.015, -0.015], 0.0)
+    steep = posterior(points[:, :2] - box.centre[:2], [0.015, -0.015], 0.0)
     slope = fitted_plane(box, after)[2]
     assert abs(slope) < 0.5 * abs(steep[2])
     assert abs(steep[2]) > 0.1
@@ -225,7 +225,7 @@ def test_a_felt_top_is_no_smoother_than_it_was_believed(spread, believed):
 
 @pytest.fixture
 def scene() -> Scene:
-    second = box_at((0.0, 0.0, 0.5), name="step", position=np.array([2.0, 1.0, 0.15]))
+    second = box_at((0.0, 0.0, 0.5), name="step", centre=np.array([2.0, 1.0, 0.15]))
     return Scene(
         boxes=(box_at(), second),
         ground_friction=0.6,
@@ -252,7 +252,7 @@ def test_each_box_is_fitted_to_its_own_contacts(scene, spread):
     new = believed_scene(scene, iter(felt))
     for b, points, after in zip(scene.boxes, (here, there), new.boxes, strict=True):
         expected = fitted_box(b, points)
-        assert np.array_equal(after.position, expected.position)
+        assert np.array_equal(after.centre, expected.centre)
         assert np.array_equal(after.rotation, expected.rotation)
         assert after.roughness == expected.roughness
     assert np.array_equal(new.goal, scene.goal)

@@ -19,8 +19,9 @@ from PIL import Image, ImageDraw
 import clamber
 from clamber.model.kinematics import Kinematics
 from clamber.show.film import Person
+from clamber.show.framing import seen_points, view_of
 from clamber.show.marks import DARK, PALE, font
-from clamber.show.renderer import Camera, seen_points, view_of
+from clamber.show.renderer import Camera
 from clamber.show.sample import keyframe_times, row_at
 from clamber.show.skeleton import paired_times, skeleton_of
 
@@ -54,11 +55,12 @@ def part(folder: Path) -> list[Image.Image]:
         words.append((view.project(points, SIZE)[:, 0].mean(), 8, name, "ma", 18))
     pictures = []
     with Camera(world, SIZE, fine=False) as camera:
+        still = camera.still(view, person.boxes)
         for t in np.linspace(0.0, end, round(FPS * seconds)):
-            shapes = person.shapes(float(np.interp(t, *paired)))
+            shapes = person.figure(float(np.interp(t, *paired)))
             q = rollout.qpos[row_at(rollout.time, t)]
             picture = Image.new("RGB", (SIZE[0], BAND + SIZE[1]), PALE)
-            picture.paste(camera.shot(q, view, shapes), (0, BAND))
+            picture.paste(camera.shot(q, view, shapes, still), (0, BAND))
             draw = ImageDraw.Draw(picture)
             for x, y, word, anchor, size in words:
                 draw.text((x, y), word, font=font(size), fill=DARK, anchor=anchor)

@@ -19,8 +19,9 @@ import clamber
 from clamber.execution.terrain import fitted_box
 from clamber.model.kinematics import Kinematics
 from clamber.run.figures import finish_axes, save_plot
+from clamber.show.framing import seen_points, view_of
 from clamber.show.pictures import mark_keyframe
-from clamber.show.renderer import Camera, seen_points, view_of
+from clamber.show.renderer import Camera
 from clamber.step.polygon import support_ellipse, support_polygon
 from clamber.step.posture import STABILITY_WEIGHT
 
@@ -103,7 +104,7 @@ def scaling(demo, sequence, plan) -> Figure:
         (robot, plan.sequence, "the same at the robot's scale"),
     ):
         for box in found.scene.boxes if ax is person else plan.world.scene.boxes:
-            low = box.position[0] - box.size[0] / 2
+            low = box.centre[0] - box.size[0] / 2
             ax.add_patch(
                 Rectangle((low, 0), box.size[0], box.size[2], fc="0.9", ec=GREY)
             )
@@ -218,7 +219,7 @@ def paths(plan) -> Figure:
     fig = Figure(figsize=(7, 3.0), layout="constrained")
     ax = fig.subplots()
     for box in plan.world.scene.boxes:
-        low = box.position[0] - box.size[0] / 2
+        low = box.centre[0] - box.size[0] / 2
         ax.add_patch(Rectangle((low, 0), 0.7, box.size[2], fc="0.9", ec=GREY))
         ax.axhline(box.size[2] + 0.05, color=GREY, ls=":", lw=1)
         ax.text(

@@ -47,7 +47,7 @@ def packed(name: str, bits: int) -> dict[str, object]:
         "source": demo.source,
         "names": list(tracks),
         "rate": options.rate,
-        "box": np.stack([box.size, box.position]),
+        "box": np.stack([box.size, box.centre]),
         "box_name": box.name,
         "noise": options.noise,
         "seed": SEED,

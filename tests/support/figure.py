@@ -260,7 +260,7 @@ def recorded(
         tracks, truth = mirror_tracks(tracks), [mirror_contact(i) for i in truth]
     size, face = table
     position = np.array([face + size[0] / 2, 0.0, size[2] / 2])
-    box = Box(name=TABLE, size=size, position=position, rotation=np.eye(3))
+    box = Box(name=TABLE, size=size, centre=position, rotation=np.eye(3))
     demo = build_demonstration(
         RawTracks(
             source=f"built-in {kind}, synthetic (noise {1e3 * o.noise:g} mm)",

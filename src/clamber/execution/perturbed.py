@@ -70,16 +70,16 @@ def perturbed_scene(scene: Scene, d: Disturbance) -> Scene:
                 value=d.height,
             )
         up = b.rotation[:, 2]
-        position = b.position + 0.5 * d.height * up
+        centre = b.centre + 0.5 * d.height * up
         turn = matrix_from_rpy((d.roll, d.pitch, 0.0))
         turn = b.rotation @ turn @ b.rotation.T
-        edge = position + b.rotation @ (size * [-0.5, 0.0, 0.5])
+        edge = centre + b.rotation @ (size * [-0.5, 0.0, 0.5])
         boxes.append(
             replace(
                 b,
                 size=size,
                 rotation=turn @ b.rotation,
-                position=edge + turn @ (position - edge),
+                centre=edge + turn @ (centre - edge),
                 friction=b.friction if d.friction is None else d.friction,
             )
         )
@@ -127,7 +127,7 @@ def _tile(
     depth = min(2.0 * unevenness + 0.02, 0.5 * float(box.size[2]))
     base = box.size[2] - depth
     geom.size = [*(box.size[:2] / 2), base / 2]
-    geom.pos = box.position - box.rotation[:, 2] * depth / 2
+    geom.pos = box.centre - box.rotation[:, 2] * depth / 2
     for i in range(n[0]):
         for j in range(n[1]):
             height = max(depth + float(off[i, j]), 0.002)
@@ -142,7 +142,7 @@ def _tile(
                 name=f"{box.name}_tile_{i}_{j}",
                 type=mujoco.mjtGeom.mjGEOM_BOX,
                 size=[*(side / 2), height / 2],
-                pos=box.position + box.rotation @ local,
+                pos=box.centre + box.rotation @ local,
                 quat=list(geom.quat),
                 friction=list(geom.friction),
                 rgba=list(geom.rgba),

@@ -57,7 +57,7 @@ def fitted_box(box: Box, points: np.ndarray) -> Box:
     return replace(
         box,
         rotation=R @ box.rotation,
-        position=middle + lowest * normal + R @ (box.position - top.position),
+        centre=middle + lowest * normal + R @ (box.centre - top.position),
         roughness=max(rough - lowest, CAUTION, box.roughness),
     )
 

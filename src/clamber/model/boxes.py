@@ -235,7 +235,7 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
             path,
             name,
         )
-    return Box(name=name, size=high - low, position=R @ (low + high) / 2, rotation=R)
+    return Box(name=name, size=high - low, centre=R @ (low + high) / 2, rotation=R)
 
 
 def _extent(v: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -310,7 +310,7 @@ def read_described(
         called = _called(name, model.body(body).name if body else "", (*boxes, *shapes))
         if kind == mujoco.mjtGeom.mjGEOM_BOX:
             size = 2.0 * model.geom_size[g]
-            box = Box(name=called, size=size, position=place, rotation=R)
+            box = Box(name=called, size=size, centre=place, rotation=R)
             boxes.append(replace(box, friction=mu))
         else:
             v, faces = _triangles(model, g)
@@ -432,7 +432,7 @@ def read_sdf(path: Path, friction: float = DEFAULT_FRICTION) -> Drawn:
                 mu = friction if text is None else min(_number(text, where, path), 1.0)
                 found = _sdf_shape(shape, where, path)
                 if isinstance(found, np.ndarray):
-                    box = Box(name=name, size=found, position=p, rotation=R)
+                    box = Box(name=name, size=found, centre=p, rotation=R)
                     boxes.append(replace(box, friction=mu))
                 elif found is not None:
                     _add(boxes, shapes, name, p + found[0] @ R.T, found[1], mu, path)

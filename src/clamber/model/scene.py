@@ -236,7 +236,7 @@ class Box:
     Attributes:
         name: Of the support that its top is.
         size: (3,) full lengths [m].
-        position: (3,) centre in the world [m].
+        centre: (3,) its middle in the world [m].
         rotation: (3, 3) of the box in the world.
         friction: Coulomb coefficient of its faces.
         roughness: Its faces are uneven by about this [m]: what is no contact keeps so
@@ -245,7 +245,7 @@ class Box:
 
     name: str
     size: np.ndarray
-    position: np.ndarray
+    centre: np.ndarray
     rotation: np.ndarray
     friction: float = 0.8
     roughness: float = 0.0
@@ -255,7 +255,7 @@ class Box:
     def __post_init__(self) -> None:
         """Copy the arrays and check their shapes."""
         object.__setattr__(self, "size", frozen_array(self.size, (3,)))
-        object.__setattr__(self, "position", frozen_array(self.position, (3,)))
+        object.__setattr__(self, "centre", frozen_array(self.centre, (3,)))
         object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
 
     @property
@@ -275,7 +275,7 @@ class Box:
         hx, hy = self.size[i] / 2, self.size[j] / 2
         return Support(
             name=self.name,
-            position=self.position + R[:, 2] * self.size[axis] / 2,
+            position=self.centre + R[:, 2] * self.size[axis] / 2,
             rotation=R,
             polygon=np.array([[-hx, -hy], [hx, -hy], [hx, hy], [-hx, hy]]),
             friction=self.friction,
@@ -454,7 +454,7 @@ class Scene:
         box = Box(
             name="box",
             size=size,
-            position=np.array([NEAR_FACE + 0.5, 0.0, height / 2]),
+            centre=np.array([NEAR_FACE + 0.5, 0.0, height / 2]),
             rotation=matrix_from_rpy([0.0, 0.0, 0.0]),
             friction=friction,
         )

@@ -69,8 +69,7 @@ class GroundFile(_Strict):
 class BoxFile(_Strict):
     """One of `boxes` of a scene file.
 
-    The third number of `position` is the height of the lower face, 0 without it; that
-    of `Box.position` is the middle's.
+    The third number of `position` is the height of the lower face, 0 without it.
     """
 
     name: str = pydantic.Field(pattern=NAME)
@@ -87,7 +86,7 @@ class BoxFile(_Strict):
         return Box(
             name=self.name,
             size=np.array(self.size),
-            position=np.array([x, y, bottom + self.size[2] / 2]),
+            centre=np.array([x, y, bottom + self.size[2] / 2]),
             rotation=matrix_from_rpy(self.rpy),
             friction=self.friction,
             roughness=self.roughness,
@@ -317,7 +316,7 @@ def read_drawn(
     names = [b.name for b in (*boxes, *shapes)]
     for b in (*boxes, *shapes):
         fault = None
-        points = b.vertices if isinstance(b, Shape) else [b.size, b.position]
+        points = b.vertices if isinstance(b, Shape) else [b.size, b.centre]
         if names.count(b.name) > 1 or b.name == GROUND or not re.match(NAME, b.name):
             fault = f"a name of its own of letters, digits and _, not {GROUND!r}"
         elif np.abs(points).max() > MAX_LENGTH:
@@ -335,7 +334,7 @@ def read_drawn(
 def _check_up(boxes: list[Box], path: Path) -> None:
     """Refuse a drawing that is half under the ground and stands on it with y up."""
     half = np.array([np.abs(b.rotation) @ b.size / 2 for b in boxes])
-    low = np.min([b.position for b in boxes] - half, axis=0)
+    low = np.min([b.centre for b in boxes] - half, axis=0)
     if low[2] < -_SUNK and low[1] > -_SUNK:
         expected = (
             f"z up: it reaches {-low[2]:.2f} m under the ground, with y up it would "

@@ -278,7 +278,7 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
             name=b.name,
             type=mujoco.mjtGeom.mjGEOM_BOX,
             size=b.size / 2,
-            pos=b.position,
+            pos=b.centre,
             quat=quat,
             friction=[b.friction, 0.02, 0.001],
             rgba=list(OBSTACLE),

@@ -255,7 +255,7 @@ def check_scene(scene: SceneLike) -> dict[str, str]:
 
 def _holds(box: Box, points: np.ndarray) -> bool:
     """Whether all points (K, 3) are inside a box."""
-    local = (points - box.position) @ box.rotation
+    local = (points - box.centre) @ box.rotation
     return bool(np.all(np.abs(local) < box.size / 2 - 1e-9))
 
 

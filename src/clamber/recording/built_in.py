@@ -56,7 +56,7 @@ def load_built_in(name: str) -> Demonstration:
         for first, count, point in z["gaps"]:
             raw[first : first + count, point] = np.nan
         box = Box(
-            name=str(z["box_name"]), size=size, position=position, rotation=np.eye(3)
+            name=str(z["box_name"]), size=size, centre=position, rotation=np.eye(3)
         )
         return build_demonstration(
             RawTracks(

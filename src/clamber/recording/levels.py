@@ -182,10 +182,10 @@ def fit_levels(demo: Demonstration) -> Demonstration:
 def _raised(box: Box, lift: float) -> Box:
     """The box with its top higher; its foot stays, unless it is tilted."""
     if abs(box.rotation[2, 2]) < 1 - 1e-9:
-        return replace(box, position=box.position + lift * _UP)
+        return replace(box, centre=box.centre + lift * _UP)
     lift = max(lift, _THIN - box.size[2])
     size = box.size + lift * _UP
-    return replace(box, size=size, position=box.position + lift / 2 * _UP)
+    return replace(box, size=size, centre=box.centre + lift / 2 * _UP)
 
 
 def _resting(

@@ -305,7 +305,7 @@ def _build(
     given = _boxes(said, folder, unit, up) if scene is None else scene
     if R is not None and scene is None and (said.boxes or "").lower().endswith(".obj"):
         turned = [
-            replace(b, position=R @ b.position + offset, rotation=R @ b.rotation)
+            replace(b, centre=R @ b.centre + offset, rotation=R @ b.rotation)
             for b in given.boxes
         ]
         given = replace(given, boxes=tuple(turned))
@@ -527,10 +527,10 @@ def lower_to_ground(
         if b.name == ground or top < _THIN:
             continue
         if abs(b.rotation[2, 2]) < 1 - 1e-9:  # a tilted box is lowered, never cut
-            kept.append(replace(b, position=b.position - [0.0, 0.0, level]))
+            kept.append(replace(b, centre=b.centre - [0.0, 0.0, level]))
             continue
-        bottom = max(float(b.position[2] - b.size[2] / 2) - level, 0.0)
+        bottom = max(float(b.centre[2] - b.size[2] / 2) - level, 0.0)
         size = np.array([b.size[0], b.size[1], top - bottom])
-        centre = np.array([b.position[0], b.position[1], (top + bottom) / 2])
-        kept.append(replace(b, size=size, position=centre))
+        centre = np.array([b.centre[0], b.centre[1], (top + bottom) / 2])
+        kept.append(replace(b, size=size, centre=centre))
     return tuple(kept), level

@@ -74,7 +74,7 @@ def _write_scene(scene: Scene) -> dict[str, Any]:
             {
                 "name": b.name,
                 "size": b.size,
-                "position": b.position - [0.0, 0.0, b.size[2] / 2],
+                "position": b.centre - [0.0, 0.0, b.size[2] / 2],
                 "rpy": _rpy(b.rotation),
                 "friction": b.friction,
                 "roughness": b.roughness,
@@ -94,9 +94,9 @@ def _read_scene(at: At) -> Scene:
         size, bottom = (CODEC.decode(Vector, box.key(n)) for n in ("size", "position"))
         boxes.append(
             Box(
-                **CODEC.fields(Box, box, without=("size", "position", "rotation")),
+                **CODEC.fields(Box, box, without=("size", "centre", "rotation")),
                 size=np.array(size),
-                position=np.add(bottom, [0.0, 0.0, size[2] / 2]),
+                centre=np.add(bottom, [0.0, 0.0, size[2] / 2]),
                 rotation=matrix_from_rpy(CODEC.decode(Vector, box.key("rpy"))),
             )
         )

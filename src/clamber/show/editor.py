@@ -186,7 +186,7 @@ class Editor:
         page: Page,
         folder: Path,
         plan: Plan,
-        replaced: Callable[[Plan | None, Rollout | None], None],
+        replaced: Callable[[Plan | None, tuple[Rollout, Verdict] | None], None],
     ) -> None:
         """Fill the folder of the panel that is open.
 
@@ -277,7 +277,7 @@ class Editor:
             self._gizmo.position = box.top.position
             self._height.value = round(float(box.size[2]), 3)
             self._box.dimensions = tuple((box.size + ALIKE).tolist())
-            self._box.position, self._box.wxyz = box.position, self._gizmo.wxyz
+            self._box.position, self._box.wxyz = box.centre, self._gizmo.wxyz
         elif contact:
             support, place = self._place(name)
             rotation = self._plan.world.supports[support].rotation
@@ -308,8 +308,8 @@ class Editor:
         if box is None:
             self._put_contact(name, self._place(name)[0], place)
         else:
-            at = box.position + (place - box.top.position) * [1.0, 1.0, 0.0]
-            self._put_box(replace(box, position=at))
+            at = box.centre + (place - box.top.position) * [1.0, 1.0, 0.0]
+            self._put_box(replace(box, centre=at))
 
     def _moved_onto(self) -> None:
         """A contact goes to the nearest place of another support."""
@@ -327,7 +327,7 @@ class Editor:
             return
         size = np.array([*box.size[:2], float(self._height.value)])
         up = (size[2] - box.size[2]) / 2 * box.rotation[:, 2]
-        self._put_box(replace(box, size=size, position=box.position + up))
+        self._put_box(replace(box, size=size, centre=box.centre + up))
 
     def _put_box(self, box: Box) -> None:
         self._edit(boxes={**self._edits.boxes, box.name: box})
@@ -365,7 +365,7 @@ class Editor:
             said.append(f"{name}: moved by {off:.0f} mm{onto}")
         was = {b.name: b for b in self._plan.world.scene.boxes}
         for name, box in self._edits.boxes.items():
-            off = 1000 * np.linalg.norm((box.position - was[name].position)[:2])
+            off = 1000 * np.linalg.norm((box.centre - was[name].centre)[:2])
             said.append(f"{name}: {box.size[2]:.3f} m high, moved by {off:.0f} mm")
         if self._edits.off:
             said.append(f"without {', '.join(sorted(self._edits.off))}")
@@ -398,7 +398,7 @@ class Editor:
         rollout = simulate(self._new, progress=self._work.report)
         verdict = judge(self._new, rollout)
         self._done = (rollout, verdict)
-        self._replaced(self._new, rollout)
+        self._replaced(self._new, self._done)
         if verdict.reached:
             return "Physics: success."
         return f"Physics: failed; not met: {verdict.failed()}."

@@ -28,18 +28,15 @@ from clamber.planning.records import Plan
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.codec import whole_file
+from clamber.show.framing import Preset, flat_axes, seen_points, view_of
 from clamber.show.marks import DARK, contact_marks, draw_marks, font, loads_of
 from clamber.show.renderer import (
     Camera,
     Colour,
-    Preset,
     Shape,
     ball,
     bar,
     block,
-    flat_axes,
-    seen_points,
-    view_of,
 )
 from clamber.show.sample import change_at, keyframe_times, thinned
 from clamber.show.skeleton import (
@@ -95,22 +92,22 @@ class Person:
         along = _middle(seen @ forward) - _middle(there @ forward)
         self._offset = across * right + along * forward
         self.points = there + self._offset  # that a camera has to have in view
-        self._boxes = [
+        self.boxes = [
             shape
             for b in demo.scene.boxes
             for shape in block(
-                s * b.size, self._placed(b.position), R @ b.rotation, PERSON_BOX
+                s * b.size, self._placed(b.centre), R @ b.rotation, PERSON_BOX
             )
         ]
 
     def _placed(self, points: np.ndarray) -> np.ndarray:
         return self._scale * points @ self._turn.T + self._offset
 
-    def shapes(self, t: float) -> list[Shape]:
-        """Bones, joints, head and boxes at a time of the recording [s]."""
+    def figure(self, t: float) -> list[Shape]:
+        """Bones, joints and head at a time of the recording [s]."""
         skeleton, s = self._skeleton, self._scale
         p, seen = skeleton.at(t)
-        p, out = self._placed(p), list(self._boxes)
+        p, out = self._placed(p), []
         for pair in skeleton.bones[seen[skeleton.bones].all(axis=1)]:
             kind = mujoco.mjtGeom.mjGEOM_CAPSULE
             if np.linalg.norm(np.diff(p[pair], axis=0)) > 1e-6:
@@ -245,13 +242,14 @@ def _frames(
             at = view.project(points, size)[:, 0]
             named.append((name, _middle(at)))
     with Camera(world, size, fine=False) as drawing:
+        still = drawing.still(view, () if person is None else person.boxes)
         for i, (row, t) in enumerate(zip(rows, times, strict=True)):
             if i % 5 == 0:
                 report("video", i / len(rows), "")
             shapes: list[Shape] = []
             if person is not None and paired is not None:
-                shapes = person.shapes(float(np.interp(t, *paired)))
-            picture = drawing.shot(rollout.qpos[row], view, shapes)
+                shapes = person.figure(float(np.interp(t, *paired)))
+            picture = drawing.shot(rollout.qpos[row], view, shapes, still)
             if marks != "none":
                 kin.update(rollout.qpos[row])
                 with_forces = forces[i] if marks == "forces" else None

@@ -156,10 +156,10 @@ def _show_run(
     """The page of a run folder: its motion, else its recording, else text."""
     notes = (fallback_note(run.written), run.execution.get("stopped", ""))
     page.begin(run.folder.resolve().name, run.missing, notes)
-    if run.verdict:
-        _add_verdict(page, run.verdict)
+    told = _Told(page.server.gui)
+    told.of_run(run.verdict)
     if run.plan is not None:
-        _RunPage(page, run, run.plan, others, person)
+        _RunPage(page, run, run.plan, others, person, told)
         return
     if person is not None:
         _show_recording(page, person)
@@ -176,20 +176,44 @@ def _show_recording(page: Page, skeleton: Skeleton) -> None:
     page.span(float(demo.t[0]), float(demo.t[-1]), skeleton.changes())
 
 
-def _add_verdict(page: Page, verdict: Verdict) -> None:
-    """Success or failure, and each criterion."""
-    gui = page.server.gui
-    colour = "#16a34a" if verdict.reached else "#dc2626"
-    said = "reached the goal" if verdict.reached else "failed"
-    gui.add_html(
-        f'<p style="margin: 4px 12px; font-weight: 600; color: {colour}">{said}</p>'
-    )
-    rows = (
-        (label if ok else f"{label}: NOT MET", value, limit)
-        for label, value, limit, ok in verdict.rows()
-    )
-    with gui.add_folder("Verdict: value, limit", expand_by_default=False):
-        gui.add_html(rows_of(rows))
+class _Told:
+    """What came of what is shown: the verdict of the run, or of the edited plan."""
+
+    def __init__(self, gui: Any) -> None:
+        """Add a line, and a folder of the criteria; empty."""
+        self._line = gui.add_html("", visible=False)
+        self._folder = gui.add_folder(
+            "Verdict: value, limit", expand_by_default=False, visible=False
+        )
+        with self._folder:
+            self._rows = gui.add_html("")
+
+    def of_run(self, verdict: Verdict | None) -> None:
+        """Of the run as it is in its folder."""
+        said = "" if verdict is None else _outcome(verdict)
+        self._show(said, verdict)
+
+    def of_edited(self, verdict: Verdict | None) -> None:
+        """Of a plan that was made on the page; None before physics."""
+        said = "no verdict yet" if verdict is None else _outcome(verdict)
+        self._show(f"edited plan: {said}", verdict)
+
+    def _show(self, said: str, verdict: Verdict | None) -> None:
+        colour = "#6b7280"
+        if verdict is not None:
+            colour = "#16a34a" if verdict.reached else "#dc2626"
+        self._line.visible, self._folder.visible = bool(said), verdict is not None
+        look = f"margin: 4px 12px; font-weight: 600; color: {colour}"
+        self._line.content = f'<p style="{look}">{said}</p>'
+        rows = () if verdict is None else verdict.rows()
+        self._rows.content = rows_of(
+            (label if ok else f"{label}: NOT MET", value, limit)
+            for label, value, limit, ok in rows
+        )
+
+
+def _outcome(verdict: Verdict) -> str:
+    return "reached the goal" if verdict.reached else "failed"
 
 
 class _RunPage:
@@ -202,8 +226,10 @@ class _RunPage:
         plan: Plan,
         others: Sequence[Run],
         skeleton: Skeleton | None,
+        told: _Told,
     ):
         page.timeline()
+        self._told, self._verdict = told, run.verdict
         self._page, self._plan, self._rollout = page, plan, run.rollout
         self._layers = dict(LAYERS)
         self._stage = self._first = Stage(page.server, plan, run.rollout, "/run")
@@ -244,13 +270,18 @@ class _RunPage:
         page.watch_slowly(self._chart.show)
         self._span()
 
-    def replace(self, plan: Plan | None, rollout: Rollout | None) -> None:
+    def replace(
+        self, plan: Plan | None, done: tuple[Rollout, Verdict] | None = None
+    ) -> None:
         """Show another plan, and what physics made of it; None: the run as it was."""
         with self._page.clock.lock:
             before = self._stage
             if plan is None:
                 plan, rollout, self._stage = self._plan, self._rollout, self._first
+                self._told.of_run(self._verdict)
             else:
+                rollout, verdict = done or (None, None)
+                self._told.of_edited(verdict)
                 self._count += 1
                 name = f"/run{self._count}"
                 server = self._page.server

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from clamber.execution.simulation import Rollout
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
-from clamber.show.renderer import View
+from clamber.show.framing import View
 from clamber.show.sample import force_by_contact, steadily_loaded, support_below
 from clamber.step.posture import Keyframe
 from clamber.step.statics import Phase

@@ -29,9 +29,10 @@ from clamber.planning.records import Plan
 from clamber.recording.demonstration import Demonstration
 from clamber.run.figures import finish_axes
 from clamber.run.folder import save_plan, save_rollout, save_verdict
+from clamber.show.framing import seen_points, view_of
 from clamber.show.live import open_view
 from clamber.show.page import Page
-from clamber.show.renderer import Camera, seen_points, view_of
+from clamber.show.renderer import Camera
 from clamber.show.skeleton import skeleton_of
 
 TILE = (220, 220)  # [px] of a posture
@@ -100,7 +101,7 @@ def _figures(demo: Demonstration) -> bytes:
     fig = Figure(figsize=(9, 1.9), layout="constrained", dpi=DPI)
     for ax, t in zip(fig.subplots(1, len(times), sharey=True), times, strict=True):
         for box in demo.scene.boxes:
-            (x, _, z), (dx, _, dz) = box.position, box.size
+            (x, _, z), (dx, _, dz) = box.centre, box.size
             corner = (x - dx / 2, z - dz / 2)
             ax.add_patch(Rectangle(corner, dx, dz, color=BOX))
         points, seen = skeleton.at(float(t))

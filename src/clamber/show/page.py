@@ -20,7 +20,7 @@ from typing import Any, cast
 import numpy as np
 
 from clamber.errors import ClamberError, InputError
-from clamber.show.renderer import PRESETS, Preset, View, frame_view
+from clamber.show.framing import PRESETS, Preset, View, frame_view
 from clamber.show.track import Track
 
 FRAMES_A_SECOND = 30

@@ -32,6 +32,14 @@ from clamber.run.folder import (
     trajectory_of,
 )
 from clamber.show.film import Marks, skeleton_of_plan, video
+from clamber.show.framing import (
+    Preset,
+    View,
+    frame_view,
+    robot_corners,
+    seen_points,
+    view_of,
+)
 from clamber.show.marks import (
     DARK,
     LINE,
@@ -51,16 +59,7 @@ from clamber.show.plots import (
     demonstration_plot,
     stability_plot,
 )
-from clamber.show.renderer import (
-    Camera,
-    Preset,
-    View,
-    frame_view,
-    outline,
-    robot_corners,
-    seen_points,
-    view_of,
-)
+from clamber.show.renderer import Camera, outline
 from clamber.show.sample import planned_forces, row_at, sample_motion
 from clamber.show.skeleton import skeleton_of
 from clamber.step.posture import Keyframe

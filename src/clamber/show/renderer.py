@@ -1,4 +1,4 @@
-"""Offscreen rendering of a world, and cameras that have all of it in view.
+"""Offscreen rendering of a world.
 
 MuJoCo's own renderer draws, through EGL where there is one, else OSMesa. What is drawn
 depends on the records alone; the same run gives the same picture.
@@ -15,39 +15,24 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
 from PIL import Image, ImageChops, ImageFilter
 
 from clamber.errors import ClamberError
-from clamber.model.kinematics import Kinematics
-from clamber.model.scene import GROUND, Scene
+from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat
 from clamber.model.world import World
-from clamber.planning.trajectory import Samples
+from clamber.show.framing import View
 from clamber.show.meshes import SHOWN_GROUPS, geom_colour
-from clamber.show.sample import thinned
 
-Preset = Literal["corner", "side", "front", "behind", "top"]
 STEEP = 70.0  # [deg] elevation from which a camera has no ahead of its own
-PRESETS: Mapping[Preset, tuple[float, float]] = {  # [deg] azimuth and elevation, of a
-    # robot that faces along x. From the left and a little behind, the box hides neither
-    # the feet on the ground nor the hands on its top.
-    "corner": (288.0, -17.0),
-    "side": (270.0, -8.0),
-    "front": (180.0, -14.0),
-    "behind": (0.0, -20.0),
-    "top": (270.0, -89.0),
-}
 Colour = tuple[float, float, float, float]  # in [0, 1]
 Shape = Callable[[mujoco.MjvGeom], None]  # makes itself of a geom that is drawn
-MARGIN = 0.08  # share of the picture left free around what must be seen
-SEEN_POSTURES = 60  # of a motion, of which all is in the picture
-NEAR = 0.35  # [height of the motion] around it boxes are in the picture
 GROUND_SHOWN = 60.0  # [m] half width of the ground in pictures
 FOG = (1.3, 4.0)  # [distance of the camera] where the ground begins and ends to fade
 HORIZON, GROUND_COLOUR, GRID_COLOUR = (
@@ -69,6 +54,9 @@ SUN, FILL, AMBIENT = 0.62, 0.26, 0.34  # of the light, colourless
 DOWN = np.array([0.0, 0.0, -1.0])
 SHADOW_MAP = 2048  # texels along a side
 SHADED = 1.0  # [distance of the camera] around what it looks at there are shadows
+SOFT = 0.012  # [height of the picture] how far a shadow's edge, or a line's, is seen
+WHOLE = 4  # pixels that are whole numbers of pixels of what is drawn for a video
+FAR_AWAY = 1000.0  # [m] where nothing is seen, nor its shadow
 PENUMBRA = 0.0035  # [height of the picture] standard deviation of a shadow's edge
 _PROBE = (
     "import mujoco; c = mujoco.GLContext(8, 8); c.make_current(); "
@@ -122,39 +110,19 @@ def _gl_context(width: int, height: int) -> Any:
     return GLContext(width, height)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class View:
-    """A camera: what it looks at [m], from how far [m] and from where [deg]."""
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Still:
+    """What does not move, drawn from one view.
 
-    lookat: np.ndarray
-    distance: float
-    azimuth: float
-    elevation: float
-    fovy: float
+    Attributes:
+        shapes: Beside the scene.
+        picture: Without shadows.
+        left: Share of the light that shadows leave.
+    """
 
-    @property
-    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Unit vectors to the right, up and forward, in the world."""
-        return _camera_axes(self.azimuth, self.elevation)
-
-    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """(..., 2) pixels from the top left of points (..., 3) in the world."""
-        right, up, forward = self.axes
-        p = points - (self.lookat - self.distance * forward)
-        scale = size[1] / 2 / math.tan(math.radians(self.fovy) / 2) / (p @ forward)
-        x, y = size[0] / 2 + (p @ right) * scale, size[1] / 2 - (p @ up) * scale
-        return np.stack([x, y], axis=-1)
-
-
-def _camera_axes(
-    azimuth: float, elevation: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    a, e = math.radians(azimuth), math.radians(elevation)
-    forward = np.array(
-        [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)]
-    )
-    right = np.array([math.sin(a), -math.cos(a), 0.0])
-    return right, np.cross(right, forward), forward
+    shapes: Sequence[Shape]
+    picture: Image.Image
+    left: Image.Image
 
 
 class Camera:
@@ -195,6 +163,10 @@ class Camera:
             model.geom_matid[world.support_geom[GROUND]] = -1
             model.geom_rgba[world.support_geom[GROUND], 3] = 0.0
         self._model, self._data = model, mujoco.MjData(model)
+        self._fovy = float(model.vis.global_.fovy)
+        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+        self._robot = frozenset(np.flatnonzero(own).tolist())
+        self._low = _lowest(model)
         self._gl = _gl_context(width, height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(
@@ -207,7 +179,7 @@ class Camera:
         self._edges = [
             edge
             for b in (boxes if len(boxes) <= MOST_EDGED else ())
-            for edge in _edges(b.size, b.position, b.rotation)
+            for edge in _edges(b.size, b.centre, b.rotation)
         ]
         for mesh in () if cutout else world.scene.meshes:
             for s in mesh.supports[:MOST_EDGED]:
@@ -228,18 +200,78 @@ class Camera:
             self._gl.free()
 
     def shot(
-        self, q: np.ndarray, view: View, shapes: Iterable[Shape] = ()
+        self,
+        q: np.ndarray,
+        view: View,
+        shapes: Iterable[Shape] = (),
+        still: Still | None = None,
     ) -> Image.Image:
-        """A picture of the configuration `q` (nq,), and of shapes beside it."""
-        self._update(q, view, shapes)
-        picture = self._drawn(self._frame).resize(self._size, Image.Resampling.BOX)
-        lit = np.asarray(self._drawn(self._shade), dtype=np.float32)
-        shaded = np.asarray(self._drawn(self._shade, shadows=True), dtype=np.float32)
+        """A picture of the configuration `q` (nq,), and of shapes beside it.
+
+        Args:
+            q: Of the robot.
+            view: From where.
+            shapes: Beside the robot.
+            still: What `still` drew from there. Only what robot and shapes cover, or
+                put in shadow, is drawn anew, in a third of the time.
+        """
+        self._update(q, view, shapes, () if still is None else still.shapes)
+        if still is None:
+            return self._shaded(*self._layers(0, 0, *self._size))
+        part = self._covered(view)
+        picture, left = still.picture.copy(), still.left.copy()
+        for layer, piece in zip((picture, left), self._layers(*part), strict=True):
+            at = [round(x * layer.width / self._size[0]) for x in part[:2]]
+            layer.paste(piece, (at[0], at[1]))
+        return self._shaded(picture, left)
+
+    def still(self, view: View, shapes: Sequence[Shape] = ()) -> Still:
+        """The scene without its robot, and shapes: what does not move in a video."""
+        q = self._model.qpos0.copy()
+        q[:3] = view.lookat + FAR_AWAY * view.axes[0]
+        self._update(q, view, (), shapes)
+        picture, left = self._layers(0, 0, *self._size)
+        return Still(shapes=shapes, picture=picture, left=left)
+
+    def _layers(self, *part: int) -> tuple[Image.Image, Image.Image]:
+        """Part of a picture without shadows, and the share of light left by them."""
+        w, h = part[2] - part[0], part[3] - part[1]
+        picture = self._drawn(self._frame, part).resize((w, h), Image.Resampling.BOX)
+        lit = np.asarray(self._drawn(self._shade, part), dtype=np.float32)
+        shaded = self._drawn(self._shade, part, shadows=True)
+        shaded = np.asarray(shaded, dtype=np.float32)
         left = (shaded.sum(axis=2) + 1.0) / (lit.sum(axis=2) + 1.0)
-        left = Image.fromarray((255 * np.minimum(left, 1.0)).astype(np.uint8))
+        return picture, Image.fromarray((255 * np.minimum(left, 1.0)).astype(np.uint8))
+
+    def _shaded(self, picture: Image.Image, left: Image.Image) -> Image.Image:
         blur = ImageFilter.GaussianBlur(PENUMBRA * left.height)
         left = left.filter(blur).resize(self._size, Image.Resampling.BILINEAR)
         return ImageChops.multiply(picture, Image.merge("RGB", (left,) * 3))
+
+    def _covered(self, view: View) -> tuple[int, int, int, int]:
+        """Pixels around what moves and its shadows, in whole pixels of each layer.
+
+        A shadow lies between what casts it and where its light meets the lowest height.
+        """
+        geoms = [self._scene.geoms[i] for i in self._moving]
+        centre = np.array([g.pos for g in geoms])
+        sizes = np.array([g.size for g in geoms])
+        radius = np.maximum(
+            np.linalg.norm(sizes, axis=1), [g.modelrbound for g in geoms]
+        )
+        down = np.maximum((self._low - centre[:, 2]) / self._sun[2], 0.0)
+        centre = np.concatenate([centre, centre + down[:, None] * self._sun])
+        radius = np.concatenate([radius, radius / -self._sun[2]])
+        near = (centre - view.lookat) @ view.axes[2] + view.distance - radius
+        if np.any(near < 0.1 * view.distance) or np.any(np.mod(self._size, WHOLE)):
+            return 0, 0, *self._size
+        at = view.project(centre, self._size)
+        span = radius / near * self._size[1] / 2
+        span = span / math.tan(math.radians(view.fovy) / 2) + SOFT * self._size[1]
+        low = np.floor((at - span[:, None]).min(axis=0) / WHOLE) * WHOLE
+        high = np.ceil((at + span[:, None]).max(axis=0) / WHOLE) * WHOLE
+        low, high = np.clip([low, high], 0, self._size).astype(int)
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
     def cutout(self, q: np.ndarray, view: View) -> Image.Image:
         """Robot and obstacles alone (RGBA), on nothing.
@@ -247,14 +279,15 @@ class Camera:
         Averaged with its mask, so that no pixel mixes with what lies behind it: edges
         keep their own colour.
         """
-        self._update(q, view, ())
-        colour = np.asarray(self._drawn(self._frame), dtype=float)
+        self._update(q, view)
+        whole = (0, 0, *self._size)
+        colour = np.asarray(self._drawn(self._frame, whole), dtype=float)
         flags = (
             mujoco.mjtRndFlag.mjRND_SEGMENT.value,
             mujoco.mjtRndFlag.mjRND_IDCOLOR.value,
         )
         self._scene.flags[list(flags)] = 1
-        drawn = np.asarray(self._drawn(self._frame))
+        drawn = np.asarray(self._drawn(self._frame, whole))
         there = np.any(drawn > 0, axis=2)[..., None].astype(float)
         self._scene.flags[list(flags)] = 0
         width, height = self._size
@@ -267,7 +300,13 @@ class Camera:
         pixels = np.concatenate([colour, 255 * share], axis=2)
         return Image.fromarray(pixels.round().astype(np.uint8), "RGBA")
 
-    def _update(self, q: np.ndarray, view: View, shapes: Iterable[Shape]) -> None:
+    def _update(
+        self,
+        q: np.ndarray,
+        view: View,
+        shapes: Iterable[Shape] = (),
+        still: Iterable[Shape] = (),
+    ) -> None:
         self._data.qpos[:] = q
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
@@ -284,11 +323,14 @@ class Camera:
             mujoco.mjtCatBit.mjCAT_ALL.value,
             scene,
         )
-        for shape in (
-            *shapes,
-            *self._edges,
-            *(c.shape(self._data) for c in self._caps),
-        ):
+        moving = [*shapes, *(c.shape(self._data) for c in self._caps)]
+        own = (mujoco.mjtObj.mjOBJ_GEOM.value, self._robot)
+        drawn = scene.geoms[: scene.ngeom]
+        self._moving = [
+            i for i, g in enumerate(drawn) if g.objtype == own[0] and g.objid in own[1]
+        ]
+        self._moving += range(scene.ngeom, scene.ngeom + len(moving))
+        for shape in (*moving, *still, *self._edges):
             if scene.ngeom < scene.maxgeom:
                 shape(scene.geoms[scene.ngeom])
                 scene.ngeom += 1
@@ -308,6 +350,8 @@ class Camera:
             (scene.lights[1], 0.7 * ahead - 0.8 * right + 0.7 * DOWN, FILL),
         ):
             way = way / np.linalg.norm(way)
+            if strength is SUN:
+                self._sun = way
             light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL.value
             light.headlight, light.castshadow = 0, int(strength is SUN)
             light.dir[:], light.pos[:] = way, view.lookat - 1.5 * size * way
@@ -319,14 +363,43 @@ class Camera:
         context.fogStart, context.fogEnd = FOG[0] * size, FOG[1] * size
         scene.flags[mujoco.mjtRndFlag.mjRND_FOG.value] = 1
 
-    def _drawn(self, size: tuple[int, int], *, shadows: bool = False) -> Image.Image:
-        """The scene as it was last updated."""
-        rect = mujoco.MjrRect(0, 0, *size)
-        pixels = np.empty((size[1], size[0], 3), dtype=np.uint8)
+    def _drawn(
+        self, size: tuple[int, int], part: Sequence[int], *, shadows: bool = False
+    ) -> Image.Image:
+        """The scene as it was last updated, a part of a picture of that size.
+
+        Args:
+            size: Width and height of all of it.
+            part: Left, top, right and bottom in pixels of `shot`.
+            shadows: With them.
+        """
+        scale = np.array(size) / self._size
+        x0, y0, x1, y1 = (np.array(part) * np.tile(scale, 2)).round().astype(int)
+        half = math.tan(math.radians(self._fovy) / 2)  # of the height, at unit depth
+        for camera in self._scene.camera:
+            unit = half * camera.frustum_near * 2 / size[1]  # of a pixel
+            camera.frustum_center = unit * ((x0 + x1) - size[0]) / 2
+            camera.frustum_top = unit * (size[1] / 2 - y0)
+            camera.frustum_bottom = unit * (size[1] / 2 - y1)
+        rect = mujoco.MjrRect(0, 0, int(x1 - x0), int(y1 - y0))
+        pixels = np.empty((rect.height, rect.width, 3), dtype=np.uint8)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = int(shadows)
         mujoco.mjr_render(rect, self._scene, self._context)
         mujoco.mjr_readPixels(pixels, None, rect, self._context)
         return Image.fromarray(pixels[::-1])
+
+
+def _lowest(model: mujoco.MjModel) -> float:
+    """Height of the ground [m], or of the lowest of what stands there below it."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    solid = (model.geom_bodyid == 0) & (
+        model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
+    )
+    R = data.geom_xmat.reshape(-1, 3, 3)[solid]
+    centre, half = np.split(model.geom_aabb[solid], 2, axis=1)
+    z = data.geom_xpos[solid, 2] + np.einsum("ij,ij->i", R[:, 2], centre)
+    return min(0.0, *(z - np.einsum("ij,ij->i", np.abs(R[:, 2]), half)), 0.0)
 
 
 def bar(kind: mujoco.mjtGeom, ends: np.ndarray, width: float, colour: Colour) -> Shape:
@@ -486,132 +559,3 @@ def _dressed(world: World, size: tuple[int, int]) -> mujoco.MjModel:
         pads = [g for s in world.surfaces.values() for g in s.geoms]
         model.geom_matid[pads], model.geom_rgba[pads] = -1, PAD_COLOUR
     return model
-
-
-def frame_view(
-    points: np.ndarray,
-    aspect: float,
-    *,
-    yaw: float = 0.0,
-    fovy: float = 45.0,
-    camera: Preset = "corner",
-) -> View:
-    """The nearest view that has all of the points (N, 3) in the picture.
-
-    With camera axes r (right), u (up), f (forward) and the picture's half widths t_r,
-    t_u at unit depth, a point p is seen from P where |(p - P) r| <= t_r (p - P) f, and
-    likewise for u: linear in P, and solved for the P farthest forward.
-
-    Args:
-        points: [m] in the world.
-        aspect: Width over height of the picture.
-        yaw: Way the robot faces at its start [rad].
-        fovy: Vertical field of view [deg].
-        camera: From where.
-    """
-    azimuth, elevation = PRESETS[camera]
-    azimuth += math.degrees(yaw)
-    right, up, forward = _camera_axes(azimuth, elevation)
-    depth = points @ forward
-    half = math.tan(math.radians(fovy) / 2) * (1 - MARGIN)
-    ends, nearest = [], math.inf
-    for axis, t in ((right, half * aspect), (up, half)):
-        x = points @ axis
-        low, high = float(np.max(x - t * depth)), float(np.min(x + t * depth))
-        ends.append((low + high) / 2)
-        nearest = min(nearest, (high - low) / (2 * t))
-    distance = float(depth.mean()) - nearest
-    position = ends[0] * right + ends[1] * up + nearest * forward
-    return View(
-        lookat=position + distance * forward,
-        distance=distance,
-        azimuth=azimuth,
-        elevation=elevation,
-        fovy=fovy,
-    )
-
-
-def robot_corners(kin: Kinematics) -> np.ndarray:
-    """(8 G, 3) corners of the boxes around the robot's geoms, in the world [m]."""
-    m, d = kin.world.model, kin.data
-    own = np.flatnonzero(m.body_rootid[m.geom_bodyid] == m.body_rootid[kin.world.base])
-    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(8, 3)
-    local = m.geom_aabb[own, None, :3] + signs * m.geom_aabb[own, None, 3:]
-    R = d.geom_xmat[own].reshape(-1, 3, 3)
-    return (np.einsum("gij,gkj->gki", R, local) + d.geom_xpos[own, None]).reshape(-1, 3)
-
-
-def view_of(
-    world: World,
-    seen: np.ndarray,
-    aspect: float,
-    camera: Preset = "corner",
-    beside: np.ndarray | None = None,
-) -> View:
-    """A view of what has to be seen of a world.
-
-    Args:
-        world: Robot and scene.
-        seen: (n, 3) as `seen_points` has them [m].
-        aspect: Width over height of the picture.
-        camera: From where.
-        beside: (m, 3) what has to be seen too [m].
-    """
-    points = seen if beside is None else np.concatenate([seen, beside])
-    fovy = float(world.model.vis.global_.fovy)
-    yaw = float(world.scene.start[2])
-    return frame_view(points, aspect, yaw=yaw, fovy=fovy, camera=camera)
-
-
-def flat_axes(world: World, camera: Preset) -> tuple[np.ndarray, np.ndarray]:
-    """Level unit vectors to the right in a picture, and away from the camera."""
-    azimuth, elevation = PRESETS[camera]
-    yaw = math.degrees(float(world.scene.start[2]))
-    right = _camera_axes(azimuth + yaw, elevation)[0]
-    return right, np.cross([0.0, 0.0, 1.0], right)
-
-
-def obstacle_points(scene: Scene, points: np.ndarray, near: float = NEAR) -> np.ndarray:
-    """(n, 3) corners of the boxes [m], of each as much as is near points (m, 3).
-
-    A box may be as large as a street, or far from where the robot goes: what is farther
-    than `near` times the height of all the points from them is left out.
-    """
-    room = near * float(np.ptp(points[:, 2])) * np.array([1.0, 1.0, 0.0])
-    low, high = points.min(axis=0) - room, points.max(axis=0) + room
-    found = [np.zeros((0, 3))]
-    boxes = (box_corners(b.size, b.position, b.rotation) for b in scene.boxes)
-    for corners in (*boxes, *(p.copy() for m in scene.meshes for p in m.pieces)):
-        if np.all(corners.max(axis=0)[:2] >= low[:2]) and np.all(
-            corners.min(axis=0)[:2] <= high[:2]
-        ):
-            corners[:, :2] = np.clip(corners[:, :2], low[:2], high[:2])
-            corners[:, 2] = np.maximum(corners[:, 2], min(low[2], 0.0))
-            found.append(corners)
-    return np.concatenate(found)
-
-
-def box_corners(
-    size: np.ndarray, centre: np.ndarray, rotation: np.ndarray
-) -> np.ndarray:
-    """(8, 3) of a box [m]."""
-    signs = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-    return centre + (signs * size) @ rotation.T
-
-
-def seen_points(
-    kin: Kinematics, q: np.ndarray | Samples, near: float = NEAR
-) -> np.ndarray:
-    """(m, 3) points that a camera has to have in view [m].
-
-    They are the corners of boxes around some of the postures (n, nq), and the obstacles
-    around them.
-    """
-    corners = []
-    for posture in thinned(q, SEEN_POSTURES):
-        kin.update(posture)
-        points = robot_corners(kin)
-        low, high = points.min(axis=0), points.max(axis=0)
-        corners.append(box_corners(high - low, (low + high) / 2, np.eye(3)))
-    seen = np.concatenate(corners)
-    return np.concatenate([seen, obstacle_points(kin.world.scene, seen, near)]).round(3)

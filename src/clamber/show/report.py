@@ -39,9 +39,9 @@ from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.run.codec import whole_file
 from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, fallback_note
+from clamber.show.framing import PRESETS, box_corners, seen_points
 from clamber.show.marks import FORCE_LENGTH
 from clamber.show.meshes import Mesh, body_meshes, body_poses
-from clamber.show.renderer import PRESETS, box_corners, seen_points
 from clamber.show.sample import (
     keyframe_times,
     read_run,

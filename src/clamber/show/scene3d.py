@@ -19,10 +19,10 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Support
 from clamber.model.se3 import frame_from_normal, quat_from_matrix
 from clamber.planning.records import Plan
+from clamber.show.framing import seen_points
 from clamber.show.marks import FORCE_LENGTH, PHASE_COLOURS
 from clamber.show.meshes import Mesh, body_meshes, body_poses
 from clamber.show.page import paragraphs
-from clamber.show.renderer import seen_points
 from clamber.show.sample import (
     change_at,
     force_by_contact,
@@ -328,7 +328,7 @@ class Figure:
                 color=PERSON_BOX,
                 dimensions=tuple(box.size),
                 wxyz=quat_from_matrix(box.rotation),
-                position=box.position,
+                position=box.centre,
             )
         none = np.zeros((1, 2, 3))
         self._bones = add.add_line_segments(

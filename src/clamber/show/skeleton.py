@@ -23,7 +23,7 @@ from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.recording.built_in import BUILT_IN, source_of
 from clamber.recording.demonstration import SIDES, Demonstration, wrist
-from clamber.show.renderer import box_corners
+from clamber.show.framing import box_corners
 
 CHEST = "Chest"  # the middle of the shoulders, which no recording has
 GAP = 0.3  # [m] between the robot's scene and the person's
@@ -134,7 +134,7 @@ def to_the_right(
 
 def corners(scene: Scene) -> np.ndarray:
     """(8 n, 3) of the boxes [m]."""
-    corners = [box_corners(b.size, b.position, b.rotation) for b in scene.boxes]
+    corners = [box_corners(b.size, b.centre, b.rotation) for b in scene.boxes]
     return np.concatenate(corners) if corners else np.zeros((0, 3))
 
 

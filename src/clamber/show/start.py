@@ -26,9 +26,9 @@ from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import new_run_folder, next_free_folder, save_proposal
+from clamber.show.framing import robot_corners
 from clamber.show.meshes import body_meshes, body_poses
 from clamber.show.page import Page, Work, paragraphs
-from clamber.show.renderer import robot_corners
 from clamber.show.scene3d import DEVIATION, PERSON_BOX, TRIANGLES, Bodies
 from clamber.show.track import EXECUTION, PLANNING
 from clamber.study.climb import Climb, ClimbResult, command_of, run_climb
@@ -162,7 +162,7 @@ class StartPage:
             record: dict[str, Any] = {
                 "name": box.name,
                 "size": box.size.round(4).tolist(),
-                "position": box.position[:2].round(4).tolist(),
+                "position": box.centre[:2].round(4).tolist(),
             }
             scene = str(folder / "box.yaml")
             Path(scene).write_text(yaml.safe_dump({"boxes": [record]}))
@@ -177,7 +177,7 @@ class StartPage:
         """As the sliders say."""
         (box,) = Scene.from_height(round(float(self._height.value), 4)).boxes
         away = float(self._distance.value) - NEAREST
-        return replace(box, position=box.position + np.array([away, 0.0, 0.0]))
+        return replace(box, centre=box.centre + np.array([away, 0.0, 0.0]))
 
     # What it looks like.
 
@@ -185,9 +185,9 @@ class StartPage:
         """The box and its gizmo, as the sliders say."""
         box = self._one_box()
         self._box.dimensions = tuple(box.size.tolist())
-        self._box.position = box.position
+        self._box.position = box.centre
         edge = np.array([-box.size[0] / 2, 0.0, box.size[2] / 2])
-        self._gizmo.position = box.position + edge
+        self._gizmo.position = box.centre + edge
 
     def _dragged(self, _: Any) -> None:
         """The gizmo, on the near edge of the box, sets the sliders."""

@@ -20,7 +20,7 @@ COSTS = {
     "simulate": 2.0,
     "save run": 0.8,
     "pictures": 5.2,
-    "video": 34.0,
+    "video": 18.0,
     "draw": 2.0,
     "report": 2.0,
     "sweep": 200.0,
