@@ -16,6 +16,7 @@ import shapely
 from scipy.spatial import ConvexHull, QhullError
 from shapely.geometry.base import BaseGeometry
 
+from clamber.model.fields import field_of
 from clamber.model.regions import (
     BORDER,
     Region,
@@ -24,7 +25,7 @@ from clamber.model.regions import (
     polygons_in,
     tidied,
 )
-from clamber.model.scene import Mesh, Rejected, Support
+from clamber.model.scene import HeightField, Mesh, Rejected, Support
 
 FILL = 0.008  # [m] of a notch in a border that a convex part may fill
 NARROW = 0.022  # [m] radius of the smallest disc that has room on a support
@@ -44,6 +45,7 @@ def mesh_of(
     *,
     friction: float,
     roughness: float = 0.0,
+    field: HeightField | None = None,
     notes: tuple[str, ...] = (),
 ) -> Mesh:
     """The terrain that triangles are the surface of.
@@ -55,6 +57,7 @@ def mesh_of(
         faces: (F, 3) counter-clockwise seen from outside.
         friction: Coulomb coefficient.
         roughness: Unevenness beyond what the triangles show [m].
+        field: Heights that the triangles are of, where they are.
         notes: What was mended, a sentence each.
     """
     surface, regions = find_regions(vertices, faces)
@@ -77,11 +80,16 @@ def mesh_of(
         support = _support(called, regions[i], ring, friction)
         supports.append(support)
         first.append(min(under[i], key=lambda p: _beside(pieces[p], support)))
+    if not surface.noisy:
+        field = None
+    elif field is None:
+        field = field_of(vertices, faces)
     return Mesh(
         name=name,
         pieces=tuple(pieces),
         supports=tuple(supports),
         under=tuple(first),
+        field=field,
         friction=friction,
         roughness=roughness,
         rejected=tuple(rejected),

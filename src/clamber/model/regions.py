@@ -82,12 +82,14 @@ class Surface:
         faces: (F, 3).
         pairs: (E, 2) faces with an edge in common.
         part: (F,) which connected part each is of.
+        noisy: It is of a scan.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     pairs: np.ndarray
     part: np.ndarray
+    noisy: bool
 
     __repr__ = short_repr
 
@@ -112,7 +114,9 @@ def find_regions(
     n = len(faces)
     links = coo_array((np.ones(len(beside[0])), tuple(beside[0].T)), shape=(n, n))
     part = connected_components(links, directed=False)[1]
-    surface = Surface(vertices=vertices, faces=faces, pairs=beside[0], part=part)
+    surface = Surface(
+        vertices=vertices, faces=faces, pairs=beside[0], part=part, noisy=turn > TURN
+    )
     return surface, _regions(vertices, faces, *beside, part, reach, turn, alike)
 
 
