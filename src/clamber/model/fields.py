@@ -10,28 +10,36 @@ import numpy as np
 
 from clamber.model.scene import HeightField
 
-FINEST = 0.004  # [m] spacing of a field
+FINEST = 0.006  # [m] spacing of a field
 SHARE = 3.0  # spacings to an edge of the triangles
 MOST_HEIGHTS = 250_000  # of a field
 UNDER = 0.05  # [m] lower than all else is what has no triangle over it
-HIDDEN = 0.02  # share of the area that may face down: more is not seen from above
+DOWN = 0.5  # of a unit normal: a wall may face down so far for noise
+HIDDEN = 0.1  # share of the area that may face down: more is not seen from above
 
 
-def field_of(vertices: np.ndarray, faces: np.ndarray) -> HeightField | None:
-    """The highest point of triangles over each place of a grid.
+def is_seen_from_above(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether nearly nothing of triangles, without most noise, faces down.
 
     Args:
         vertices: (V, 3) in the world [m].
         faces: (F, 3) counter-clockwise seen from outside.
-
-    Returns:
-        None where much of them cannot be seen from above.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)
-    if area[normal[:, 2] < 0.0].sum() > HIDDEN * area.sum():
-        return None
+    return bool(area[normal[:, 2] < -DOWN * area].sum() <= HIDDEN * area.sum())
+
+
+def field_of(vertices: np.ndarray, faces: np.ndarray) -> HeightField:
+    """The highest point of triangles over each place of a grid.
+
+    Args:
+        vertices: (V, 3) in the world [m].
+        faces: (F, 3).
+    """
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
     low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
     edge = float(np.median(np.linalg.norm((b - a)[:, :2], axis=1)))
     spacing = max(
@@ -41,8 +49,6 @@ def field_of(vertices: np.ndarray, faces: np.ndarray) -> HeightField | None:
     step = (high - low) / (count - 1)
     heights = _heights(a, b, c, normal, low, step, count)
     known = np.isfinite(heights)
-    if not known.any():
-        return None
     heights[~known] = heights[known].min() - UNDER
     return HeightField(
         heights=heights, size=high - low, position=(low + high) / 2, yaw=0.0

@@ -16,7 +16,7 @@ import shapely
 from scipy.spatial import ConvexHull, QhullError
 from shapely.geometry.base import BaseGeometry
 
-from clamber.model.fields import field_of
+from clamber.model.fields import field_of, is_seen_from_above
 from clamber.model.regions import (
     BORDER,
     Region,
@@ -82,7 +82,7 @@ def mesh_of(
         first.append(min(under[i], key=lambda p: _beside(pieces[p], support)))
     if not surface.noisy:
         field = None
-    elif field is None:
+    elif field is None and is_seen_from_above(surface.vertices, surface.faces):
         field = field_of(vertices, faces)
     return Mesh(
         name=name,
@@ -313,6 +313,8 @@ def _supports(
     """Region and convex polygon (K, 2) of each support; what is none, and why."""
     found, rejected = [], []
     middle, radius = _balls(pieces)
+    corners = np.concatenate([*pieces, np.zeros((0, 3))])
+    first = np.cumsum([0, *(len(p) for p in pieces)])[:-1]
     for i, region in enumerate(regions):
         if region.normal[2] < STEEPEST:
             continue
@@ -337,8 +339,10 @@ def _supports(
         if shape.is_empty:
             continue
         centre = region.world(np.array(around.coords))[0]
-        near = np.flatnonzero(np.linalg.norm(middle - centre, axis=1) < reach + COVERED)
-        over = (_over(region.local(pieces[k])) for k in near.tolist())
+        z = (corners - region.origin) @ region.normal
+        near = np.linalg.norm(middle - centre, axis=1) < reach + COVERED
+        near &= np.maximum.reduceat(z, first) > EVEN
+        over = (_over(region.local(pieces[k])) for k in np.flatnonzero(near))
         covers = [c for c in over if c is not None]
         left = shape.difference(shapely.union_all(covers)) if covers else shape
         left = tidied(left)
