@@ -233,6 +233,22 @@ def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(edges))
 
 
+def averaged(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
+    """Vertices (V, 3), each the mean of itself and of those beside it, some times.
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3).
+        rounds: How often.
+    """
+    a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    count = 1.0 + np.bincount(a, minlength=len(vertices))
+    for _ in range(rounds):
+        beside = [np.bincount(a, v[b], len(vertices)) for v in vertices.T]
+        vertices = (vertices + np.stack(beside, axis=1)) / count[:, None]
+    return vertices
+
+
 def merged(
     vertices: np.ndarray, faces: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray]:
