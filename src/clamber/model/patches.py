@@ -342,7 +342,7 @@ def _supports(
         z = (corners - region.origin) @ region.normal
         near = np.linalg.norm(middle - centre, axis=1) < reach + COVERED
         near &= np.maximum.reduceat(z, first) > EVEN
-        over = (_over(region.local(pieces[k])) for k in np.flatnonzero(near))
+        over = (_over(region.local(pieces[k])) for k in np.flatnonzero(near).tolist())
         covers = [c for c in over if c is not None]
         left = shape.difference(shapely.union_all(covers)) if covers else shape
         left = tidied(left)

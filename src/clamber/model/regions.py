@@ -449,14 +449,14 @@ def _area_in(ends: np.ndarray, triangles: np.ndarray, ragged: float) -> BaseGeom
     that have a triangle (m, 3, 2) over them.
     """
     area = float(np.abs(_doubled_area(triangles)).sum() / 2)
-    lines = shapely.multilinestrings(shapely.linestrings(ends))
+    lines = shapely.MultiLineString(list(ends))
     shape = shapely.Polygon()
     if ragged == 0.0:
         with contextlib.suppress(shapely.errors.GEOSException):
             shape = shapely.build_area(lines)
     if not shape.is_valid or abs(shape.area - area) > 0.05 * area:
         cells = shapely.get_parts(shapely.polygonize([shapely.node(lines)]))
-        tree = shapely.STRtree(shapely.polygons(triangles))
+        tree = shapely.STRtree(np.atleast_1d(shapely.polygons(triangles)))
         full = tree.query(shapely.point_on_surface(cells), predicate="intersects")[0]
         shape = shapely.coverage_union_all(cells[np.unique(full)])
     if ragged > 0.0:
