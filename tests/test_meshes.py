@@ -237,3 +237,29 @@ def test_the_built_in_robot_has_a_mesh_for_each_body_that_shows():
     shown = set(world.model.geom_bodyid[world.model.geom_group <= 2].tolist())
     assert {m.body for m in meshes} == shown
     assert sum(len(m.triangles) for m in meshes) < MAX_TRIANGLES
+
+
+def test_a_height_field_is_drawn_where_rays_meet_it(rng):
+    heights = rng.uniform(size=(5, 7))
+    heights = (heights - heights.min()) / np.ptp(heights)
+    spec = mujoco.MjSpec()
+    spec.add_hfield(
+        name="h", nrow=5, ncol=7, size=[0.3, 0.2, 0.1, 0.1], userdata=heights.ravel()
+    )
+    kind = mujoco.mjtGeom.mjGEOM_HFIELD
+    turned = [np.cos(0.2), 0.0, 0.0, np.sin(0.2)]
+    spec.worldbody.add_geom(type=kind, hfieldname="h", pos=[1, 0, 0.5], quat=turned)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    shape = geom_triangles(model, 0)
+    assert shape is not None
+    v, n, f = shape
+    assert np.all(n[:, 2] > 0.0)
+    for face in f:
+        p = v[face].mean(axis=0)
+        down = np.array([0.0, 0.0, -1.0])
+        hit = mujoco.mj_ray(
+            model, data, p - down, down, None, 1, -1, np.zeros(1, np.int32)
+        )
+        assert hit == pytest.approx(1.0, abs=1e-6)

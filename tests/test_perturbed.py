@@ -19,7 +19,9 @@ from clamber.execution.perturbed import (
     push_of,
 )
 from clamber.execution.simulation import simulate
-from clamber.model.scene import Box, Scene
+from clamber.model.boxes import grid_triangles
+from clamber.model.patches import mesh_of
+from clamber.model.scene import Box, Mesh, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.world import PHYSICS_STEP, World, build_world
 
@@ -466,3 +468,62 @@ def test_the_same_seed_pushes_the_same_and_the_force_only_scales_it():
 def test_a_run_too_short_for_the_margins_is_pushed_at_its_earliest():
     push = push_of(Disturbance(push=10.0), 0.8)
     assert np.flatnonzero(push.any(axis=1))[0] * PHYSICS_STEP == PUSH_MARGIN
+
+
+# Scans.
+
+
+def scanned(noise: float, rng) -> Mesh:
+    """A block of 0.2 m on the ground as it is seen from above, with noise."""
+    x, y = np.arange(0.21, 0.91, 0.02), np.arange(-0.3, 0.31, 0.02)
+    inside = (x > 0.24) & (x < 0.88) & (np.abs(y[:, None]) < 0.28)
+    vertices, faces = grid_triangles(x, y, np.where(inside, 0.2, 0.0))
+    vertices = vertices + rng.uniform(-noise, noise, size=vertices.shape)
+    return mesh_of("scan", vertices, faces, friction=0.7)
+
+
+def test_physics_meets_a_scan_as_it_was_measured_and_keeps_where_the_robot_stands(
+    coman, rng
+):
+    mesh = scanned(0.005, rng)
+    planned = build_world(coman, Scene(meshes=(mesh,), start=np.zeros(3)))
+    truth = perturbed_world(planned, Disturbance())
+    assert np.array_equal(truth.home, planned.home)
+    (field,) = np.flatnonzero(truth.model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
+    assert np.all(truth.model.geom_friction[field] == [0.7, 0.02, 0.001])
+    assert truth.support_of_geom[field] == mesh.supports[0].name
+    data = mujoco.MjData(truth.model)
+    mujoco.mj_forward(truth.model, data)
+    assert mesh.field is not None
+    heights, down = mesh.field.heights, np.array([0.0, 0.0, -1.0])
+    rows, columns = heights.shape
+    left, right = (mesh.field.position + s * mesh.field.size / 2 for s in (-1, 1))
+    for i, j in rng.integers(3, (rows - 3, columns - 3), size=(50, 2)):
+        xy = left + (right - left) * [j / (columns - 1), i / (rows - 1)]
+        found = mujoco.mj_ray(
+            truth.model,
+            data,
+            np.array([*xy, 1.0]),
+            down,
+            None,
+            1,
+            int(truth.base),
+            np.zeros(1, np.int32),
+        )
+        assert 1.0 - found == pytest.approx(max(heights[i, j], 0.0), abs=1e-4)
+
+
+def test_a_scan_is_raised_with_its_field(coman, rng):
+    planned = Scene(meshes=(scanned(0.005, rng),), start=np.zeros(3))
+    raised = perturbed_scene(planned, Disturbance(height=0.03)).meshes[0]
+    before = planned.meshes[0].field
+    assert before is not None
+    assert raised.field is not None
+    np.testing.assert_allclose(raised.field.heights, before.heights + 0.03)
+
+
+def test_without_noise_physics_has_the_pieces_that_were_planned_with(coman, rng):
+    mesh = scanned(0.0, rng)
+    assert mesh.field is None
+    planned = build_world(coman, Scene(meshes=(mesh,), start=np.zeros(3)))
+    assert perturbed_world(planned, Disturbance()) is planned

@@ -9,7 +9,9 @@ import pytest
 import trimesh
 from PIL import Image
 
+import clamber
 from clamber.errors import InputError
+from clamber.model.boxes import grid_triangles
 from clamber.model.terrain import load_scene
 
 UPRIGHT = "meshes:\n  - {{name: rock, file: {file}, {more}friction: 0.7}}\n"
@@ -203,3 +205,27 @@ def test_two_shapes_of_one_name_are_refused(tmp_path):
     (tmp_path / "s.yaml").write_text("meshes:\n" + 2 * entry)
     with pytest.raises(InputError, match=r"meshes.*different names"):
         load_scene(tmp_path / "s.yaml")
+
+
+def test_far_too_many_triangles_with_noise_are_put_together_to_one_surface(tmp_path):
+    x, y = np.linspace(0.25, 1.05, 401), np.linspace(-0.4, 0.4, 401)
+    z = np.random.default_rng(0).normal(0.25, 0.002, size=(401, 401))
+    vertices, faces = grid_triangles(x, y, z)
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "fine.ply")
+    mesh = loaded(tmp_path, "fine.ply")
+    assert any("320000 triangles put together" in note for note in mesh.notes)
+    assert not any("wrong way" in note for note in mesh.notes)
+    (top,) = mesh.supports
+    assert top.position[2] == pytest.approx(0.25, abs=2e-3)
+    assert np.all(np.ptp(top.polygon, axis=0) > 0.75)
+
+
+def test_a_mesh_without_a_support_says_why_it_has_none(tmp_path):
+    steep = box((1.0, 1.2, 0.3), 0.0)
+    turn = trimesh.transformations.rotation_matrix(-0.75, (0, 1, 0))
+    steep.apply_transform(turn).apply_translation((0.9, 0.0, 0.4))
+    steep.export(tmp_path / "steep.stl")
+    loaded(tmp_path, "steep.stl")
+    sequence = clamber.detect_contacts(clamber.load_demo("climb"))
+    with pytest.raises(InputError, match=r"scene.meshes.rock .*too steep: 43 "):
+        clamber.plan(sequence, "coman", tmp_path / "s.yaml")

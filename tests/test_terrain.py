@@ -1,4 +1,4 @@
-"""Felt contacts -> boxes, against the posterior written out another way."""
+"""Felt contacts -> boxes and meshes, against the posterior written out another way."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
@@ -17,8 +19,10 @@ from clamber.execution.terrain import (
     SLOPE_SIGMA,
     believed_scene,
     fitted_box,
+    fitted_mesh,
 )
-from clamber.model.scene import Box, Scene
+from clamber.model.patches import mesh_of
+from clamber.model.scene import Box, Mesh, Scene
 from clamber.model.se3 import matrix_from_rpy
 
 PRIOR = np.array([HEIGHT_SIGMA, SLOPE_SIGMA, SLOPE_SIGMA])
@@ -263,3 +267,75 @@ def test_a_box_that_was_not_touched_is_believed_as_before(scene, spread):
     new = believed_scene(scene, felt)
     assert new.boxes[0] is scene.boxes[0]
     assert new.boxes[1].top.position[2] > scene.boxes[1].top.position[2] + 0.01
+
+
+# Meshes.
+
+
+@pytest.fixture
+def steps() -> Mesh:
+    """Two blocks of one mesh, the second higher, with a support each."""
+    solids = []
+    for x, height in ((0.5, 0.2), (1.1, 0.3)):
+        block = trimesh.creation.box((0.6, 1.0, height))
+        solids.append(block.apply_translation((x, 0.0, height / 2)))
+    both = trimesh.util.concatenate(solids)
+    return mesh_of("m", np.asarray(both.vertices), np.asarray(both.faces), friction=0.8)
+
+
+def over(support, xy: np.ndarray, off) -> np.ndarray:
+    """(n, 3) points over places (n, 2) of a support, at heights `off`."""
+    local = np.column_stack([xy, np.broadcast_to(off, len(xy))])
+    return support.position + local @ support.rotation.T
+
+
+def test_a_support_of_a_mesh_becomes_the_plane_that_was_felt_and_its_piece_too(
+    steps, spread
+):
+    s = steps.supports[0]
+    xy = spread * [0.25, 0.4] / np.abs(spread).max(axis=0)
+    felt = over(s, xy, 0.02 + xy @ [0.02, -0.01])
+    after = fitted_mesh(steps, {s.name: felt})
+    assert np.abs(after.supports[0].height(felt)).max() < 0.004
+    new, piece = after.supports[0], after.pieces[after.under[0]]
+    before = steps.pieces[steps.under[0]]
+    was_top = np.abs(s.height(before)) < 1e-6
+    assert was_top.sum() == 4
+    assert np.abs(new.height(piece[was_top])).max() < 1e-3
+    assert ConvexHull(piece).volume > ConvexHull(before).volume
+
+
+def test_where_one_support_is_higher_the_others_are_believed_higher_as_well(
+    steps, spread
+):
+    s, other = steps.supports
+    felt = over(s, 0.1 * spread / np.abs(spread).max(), 0.03)
+    after = fitted_mesh(steps, {s.name: felt})
+    rise = after.supports[1].position - other.position
+    assert rise[:2] == pytest.approx(0.0)
+    assert 0.02 < rise[2] < 0.03
+    assert after.pieces[after.under[1]] == pytest.approx(
+        steps.pieces[steps.under[1]] + rise
+    )
+    assert np.array_equal(after.supports[1].rotation, other.rotation)
+
+
+def test_two_supports_that_were_felt_at_different_heights_are_both_there(steps, spread):
+    xy = 0.1 * spread / np.abs(spread).max()
+    felt = {
+        s.name: over(s, xy, off)
+        for s, off in zip(steps.supports, (0.01, -0.012), strict=True)
+    }
+    after = fitted_mesh(steps, felt)
+    for s in after.supports:
+        assert np.abs(s.height(felt[s.name])).max() < 0.004
+
+
+def test_a_mesh_is_fitted_in_its_scene_and_stays_where_nothing_was_felt(steps, spread):
+    scene = Scene(meshes=(steps,), start=np.zeros(3))
+    assert believed_scene(scene, []).meshes[0] is steps
+    s = steps.supports[0]
+    felt = over(s, 0.1 * spread / np.abs(spread).max(), 0.02)
+    new = believed_scene(scene, [(s.name, p) for p in felt]).meshes[0]
+    assert new.supports[0].position[2] > s.position[2] + 0.015
+    assert new.roughness == CAUTION

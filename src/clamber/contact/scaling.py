@@ -66,6 +66,12 @@ def _obstacles(
     found = [(b.name, (b.top,)) for b in scene.boxes]
     found += [(m.name, m.supports) for m in scene.meshes if m.supports]
     if len(found) < len(touched):
+        for m in (m for m in scene.meshes if not m.supports):
+            raise InputError(
+                "a part of it that is flat, level and wide enough to stand on",
+                field=f"scene.meshes.{m.name}",
+                value=sorted({r.why for r in m.rejected}) or "nothing flat",
+            )
         raise InputError(
             f"as many boxes as the demonstration touches ({len(touched)})",
             field="scene.boxes",

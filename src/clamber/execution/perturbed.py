@@ -15,9 +15,10 @@ from scipy.ndimage import gaussian_filter
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.model.scene import Box, Mesh, Scene
-from clamber.model.se3 import matrix_from_rpy
+from clamber.model.se3 import matrix_from_rpy, quat_from_yaw
 from clamber.model.world import PHYSICS_STEP, World, build_world, recompiled
 
+BASE = 0.4  # [m] of a height field under its lowest height
 TILE = 0.1  # [m] side of the tiles of an uneven top, about
 SWELL = 0.15  # [m] standard deviation of the kernel that their heights are smoothed by
 PUSH_TIME = 0.2  # [s]
@@ -37,12 +38,12 @@ def perturbed_world(
     Raises:
         InputError: A box would vanish.
     """
-    d = disturbance
-    if truth is None and not d.changes_world:
-        return world
-    scene = perturbed_scene(world.scene if truth is None else truth, d)
-    base = build_world(world.robot, scene)
-    if d.unevenness == 0 and d.mass == 1 and d.effort == 1:
+    d, base, scene = disturbance, world, world.scene
+    if truth is not None or d.changes_world:
+        scene = perturbed_scene(world.scene if truth is None else truth, d)
+        base = build_world(world.robot, scene)
+    scanned = [m for m in scene.meshes if m.field is not None]
+    if d.unevenness == 0 and d.mass == 1 and d.effort == 1 and not scanned:
         return base
 
     def perturb(spec: mujoco.MjSpec) -> None:
@@ -50,12 +51,15 @@ def perturbed_world(
         if d.unevenness > 0:
             for b in scene.boxes:
                 _tile(spec, b, d.unevenness, rng)
+        for m in scanned:
+            _measured(spec, m)
         for a in spec.actuators:
             a.forcerange = [d.effort * float(x) for x in a.forcerange]
         if d.mass != 1:
             _weigh(spec, base.model, d.mass)
 
-    return recompiled(base, perturb)
+    out = recompiled(base, perturb)
+    return replace(out, home=base.home) if scanned else out  # clear of its pieces
 
 
 def perturbed_scene(scene: Scene, d: Disturbance) -> Scene:
@@ -101,7 +105,43 @@ def _raised(mesh: Mesh, d: Disturbance) -> Mesh:
         replace(s, position=s.position + up, friction=mu) for s in mesh.supports
     )
     pieces = tuple(p + up for p in mesh.pieces)
-    return replace(mesh, pieces=pieces, supports=tuple(supports), friction=mu)
+    field = mesh.field
+    if field is not None:
+        field = replace(field, heights=field.heights + d.height)
+    return replace(
+        mesh, pieces=pieces, supports=tuple(supports), field=field, friction=mu
+    )
+
+
+def _measured(spec: mujoco.MjSpec, mesh: Mesh) -> None:
+    """Put the height field of a mesh in the place of its pieces, with their contact."""
+    field = mesh.field
+    assert field is not None
+    geom = spec.geom(mesh.piece_name(0))
+    look = {k: getattr(geom, k) for k in ("priority", "condim")}
+    look |= {k: list(getattr(geom, k)) for k in ("friction", "rgba", "solref")}
+    for i in range(len(mesh.pieces)):
+        spec.delete(spec.geom(mesh.piece_name(i)))
+        spec.delete(spec.mesh(mesh.piece_name(i)))
+    low = float(field.heights.min())
+    rise = max(float(field.heights.max()) - low, 1e-3)
+    rows, columns = field.heights.shape
+    name = mesh.piece_name(0)
+    spec.add_hfield(
+        name=name,
+        nrow=rows,
+        ncol=columns,
+        size=[*(field.size / 2), rise, BASE],
+        userdata=((field.heights - low) / rise).ravel(),
+    )
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname=name,
+        pos=[*field.position, low],
+        quat=quat_from_yaw(field.yaw),
+        **look,
+    )
 
 
 def _upright(box: Box) -> Box:

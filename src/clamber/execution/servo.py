@@ -46,7 +46,8 @@ def driven_world(world: World, mode: ControlMode) -> World:
 
     gains = {**world.robot.gains, **{n: (*g, 0.0) for n, g in soft.items()}}
     robot = replace(world.robot, gains=gains)
-    return replace(recompiled(world, soften, robot), robot=world.robot)
+    out = recompiled(world, soften, robot)
+    return replace(out, robot=world.robot, home=world.home)
 
 
 def joint_servo(world: World) -> _core.JointServo:

@@ -16,6 +16,7 @@ import shapely
 from scipy.spatial import ConvexHull, QhullError
 from shapely.geometry.base import BaseGeometry
 
+from clamber.model.fields import field_of, is_seen_from_above
 from clamber.model.regions import (
     BORDER,
     Region,
@@ -24,7 +25,7 @@ from clamber.model.regions import (
     polygons_in,
     tidied,
 )
-from clamber.model.scene import Mesh, Rejected, Support
+from clamber.model.scene import HeightField, Mesh, Rejected, Support
 
 FILL = 0.008  # [m] of a notch in a border that a convex part may fill
 NARROW = 0.022  # [m] radius of the smallest disc that has room on a support
@@ -44,6 +45,7 @@ def mesh_of(
     *,
     friction: float,
     roughness: float = 0.0,
+    field: HeightField | None = None,
     notes: tuple[str, ...] = (),
 ) -> Mesh:
     """The terrain that triangles are the surface of.
@@ -55,6 +57,7 @@ def mesh_of(
         faces: (F, 3) counter-clockwise seen from outside.
         friction: Coulomb coefficient.
         roughness: Unevenness beyond what the triangles show [m].
+        field: Heights that the triangles are of, where they are.
         notes: What was mended, a sentence each.
     """
     surface, regions = find_regions(vertices, faces)
@@ -77,11 +80,16 @@ def mesh_of(
         support = _support(called, regions[i], ring, friction)
         supports.append(support)
         first.append(min(under[i], key=lambda p: _beside(pieces[p], support)))
+    if not surface.noisy:
+        field = None
+    elif field is None and is_seen_from_above(surface.vertices, surface.faces):
+        field = field_of(vertices, faces)
     return Mesh(
         name=name,
         pieces=tuple(pieces),
         supports=tuple(supports),
         under=tuple(first),
+        field=field,
         friction=friction,
         roughness=roughness,
         rejected=tuple(rejected),
@@ -305,6 +313,8 @@ def _supports(
     """Region and convex polygon (K, 2) of each support; what is none, and why."""
     found, rejected = [], []
     middle, radius = _balls(pieces)
+    corners = np.concatenate([*pieces, np.zeros((0, 3))])
+    first = np.cumsum([0, *(len(p) for p in pieces)])[:-1]
     for i, region in enumerate(regions):
         if region.normal[2] < STEEPEST:
             continue
@@ -329,8 +339,10 @@ def _supports(
         if shape.is_empty:
             continue
         centre = region.world(np.array(around.coords))[0]
-        near = np.flatnonzero(np.linalg.norm(middle - centre, axis=1) < reach + COVERED)
-        over = (_over(region.local(pieces[k])) for k in near.tolist())
+        z = (corners - region.origin) @ region.normal
+        near = np.linalg.norm(middle - centre, axis=1) < reach + COVERED
+        near &= np.maximum.reduceat(z, first) > EVEN
+        over = (_over(region.local(pieces[k])) for k in np.flatnonzero(near).tolist())
         covers = [c for c in over if c is not None]
         left = shape.difference(shapely.union_all(covers)) if covers else shape
         left = tidied(left)

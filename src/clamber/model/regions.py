@@ -10,6 +10,7 @@ the frame P of their region: origin in its plane, z along the outward normal.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Iterator
@@ -82,12 +83,14 @@ class Surface:
         faces: (F, 3).
         pairs: (E, 2) faces with an edge in common.
         part: (F,) which connected part each is of.
+        noisy: It is of a scan.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     pairs: np.ndarray
     part: np.ndarray
+    noisy: bool
 
     __repr__ = short_repr
 
@@ -112,8 +115,10 @@ def find_regions(
     n = len(faces)
     links = coo_array((np.ones(len(beside[0])), tuple(beside[0].T)), shape=(n, n))
     part = connected_components(links, directed=False)[1]
-    surface = Surface(vertices=vertices, faces=faces, pairs=beside[0], part=part)
-    return surface, _regions(vertices, faces, *beside, part, reach, turn, alike)
+    surface = Surface(
+        vertices=vertices, faces=faces, pairs=beside[0], part=part, noisy=turn > TURN
+    )
+    return surface, _regions(vertices, faces, beside[0], part, reach, turn, alike)
 
 
 def neighbours(
@@ -228,6 +233,22 @@ def _median_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.median(edges))
 
 
+def averaged(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
+    """Vertices (V, 3), each the mean of itself and of those beside it, some times.
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3).
+        rounds: How often.
+    """
+    a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    count = 1.0 + np.bincount(a, minlength=len(vertices))
+    for _ in range(rounds):
+        beside = [np.bincount(a, v[b], len(vertices)) for v in vertices.T]
+        vertices = (vertices + np.stack(beside, axis=1)) / count[:, None]
+    return vertices
+
+
 def merged(
     vertices: np.ndarray, faces: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -273,7 +294,6 @@ def _regions(
     vertices: np.ndarray,
     faces: np.ndarray,
     pairs: np.ndarray,
-    edge: np.ndarray,
     part: np.ndarray,
     reach: float,
     turn: float,
@@ -303,7 +323,7 @@ def _regions(
     )
     label = _joined(vertices, faces, normals, areas, pairs, label, reach)
     ragged = ROUGHEST if turn > TURN else 0.0
-    return _bordered(vertices, faces, normals, areas, pairs, edge, label, part, ragged)
+    return _bordered(vertices, faces, normals, areas, label, part, ragged)
 
 
 def _joined(
@@ -358,8 +378,6 @@ def _bordered(
     faces: np.ndarray,
     normals: np.ndarray,
     areas: np.ndarray,
-    pairs: np.ndarray,
-    edge: np.ndarray,
     label: np.ndarray,
     part: np.ndarray,
     ragged: float,
@@ -368,10 +386,7 @@ def _bordered(
 
     Borders of noisy meshes are `ragged` by so much [m].
     """
-    inner = np.zeros((len(faces), 3), dtype=bool)
-    same = label[pairs[:, 0]] == label[pairs[:, 1]]
-    for k in range(2):
-        inner[pairs[same, k], edge[same, k]] = True
+    border = _borders(faces, label)
     order = np.argsort(label, kind="stable")
     out = []
     for mine in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
@@ -387,7 +402,7 @@ def _bordered(
         normal = _fitted(corners, w, origin, normal / length)
         R = frame_from_normal(normal, [1.0, 0.0, 0.0])
         flat = ((corners - origin) @ R)[..., :2]
-        ends = np.stack([flat, np.roll(flat, -1, axis=1)], axis=2)[~inner[mine]]
+        ends = np.stack([flat, np.roll(flat, -1, axis=1)], axis=2)[border[mine]]
         shape = _area_in(ends, flat, ragged)
         if not shape.is_empty:
             out.append(
@@ -400,6 +415,21 @@ def _bordered(
                 )
             )
     return out
+
+
+def _borders(faces: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(F, 3) edges that an odd number of faces with one label have: closed lines."""
+    a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    size = np.int64(faces.max()) + 1
+    key = np.minimum(a, b) * size + np.maximum(a, b)
+    of = np.repeat(label, 3)
+    order = np.lexsort([key, of])
+    new = (np.diff(key[order], prepend=-1) != 0) | (np.diff(of[order], prepend=-1) != 0)
+    starts = np.flatnonzero(new)
+    count = np.diff(starts, append=len(order))
+    out = np.zeros(len(key), dtype=bool)
+    out[order[starts[count % 2 == 1]]] = True
+    return out.reshape(-1, 3)
 
 
 def _fitted(
@@ -415,20 +445,20 @@ def _fitted(
 def _area_in(ends: np.ndarray, triangles: np.ndarray, ragged: float) -> BaseGeometry:
     """What is inside border lines (n, 2, 2), straightened, small holes closed.
 
-    Where lines cross, as the folds of a noisy border do, the triangles (m, 3, 2) are
-    put together instead.
+    Where lines cross, as the folds of a noisy border do, it is the cells between them
+    that have a triangle (m, 3, 2) over them.
     """
     area = float(np.abs(_doubled_area(triangles)).sum() / 2)
     lines = shapely.MultiLineString(list(ends))
-    for crossing in (False, True):
-        try:
-            shape = shapely.build_area(shapely.node(lines) if crossing else lines)
-        except shapely.errors.GEOSException:
-            continue
-        if shape.is_valid and abs(shape.area - area) < 0.05 * area:
-            break
-    else:
-        shape = shapely.union_all(shapely.make_valid(shapely.polygons(triangles)))
+    shape = shapely.Polygon()
+    if ragged == 0.0:
+        with contextlib.suppress(shapely.errors.GEOSException):
+            shape = shapely.build_area(lines)
+    if not shape.is_valid or abs(shape.area - area) > 0.05 * area:
+        cells = shapely.get_parts(shapely.polygonize([shapely.node(lines)]))
+        tree = shapely.STRtree(np.atleast_1d(shapely.polygons(triangles)))
+        full = tree.query(shapely.point_on_surface(cells), predicate="intersects")[0]
+        shape = shapely.coverage_union_all(cells[np.unique(full)])
     if ragged > 0.0:
         even = shape.buffer(ragged, join_style="mitre", mitre_limit=2.0)
         even = even.buffer(-2.0 * ragged, join_style="mitre", mitre_limit=2.0)

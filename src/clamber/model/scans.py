@@ -24,6 +24,7 @@ CLOUDS = (".pcd", ".npy")
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 SMALLEST = 0.02  # [m] terrain less wide than this is in another unit
 MOST = 250_000  # triangles that are looked at one by one
+ROUNDS = 6  # of averaging, before neighbours are put together
 MOST_POINTS = 20_000_000
 _SAME = 1e-5  # [m] nearer vertices are one
 
@@ -114,10 +115,12 @@ def mended(
     Raises:
         InputError: Nothing is left.
     """
-    from clamber.model.regions import merged  # brings SciPy and shapely with it
+    from clamber.model.regions import averaged, merged  # bring SciPy and shapely
 
     notes, count = list(notes), len(faces)
     cell = 0.005
+    if len(faces) > MOST:  # else noise would be cut into layers
+        vertices = averaged(vertices, faces, ROUNDS)
     while len(faces) > MOST:
         vertices, faces = merged(vertices, faces, cell)
         cell *= 1.5

@@ -302,6 +302,34 @@ class Rejected:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class HeightField:
+    """Heights over a rectangle, linear between them.
+
+    Attributes:
+        heights: (rows, columns) in the world [m], rows along y, columns along x.
+        size: (2,) of the rectangle, whose border the outermost heights are on [m].
+        position: (2,) of its middle [m].
+        yaw: By which it is turned [rad].
+    """
+
+    heights: np.ndarray
+    size: np.ndarray
+    position: np.ndarray
+    yaw: float
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        """Copy the arrays and check their shapes."""
+        heights = frozen_array(self.heights)
+        if heights.ndim != 2 or min(heights.shape) < 2:
+            raise ValueError(f"heights {heights.shape} are no rows and columns")
+        object.__setattr__(self, "heights", heights)
+        object.__setattr__(self, "size", frozen_array(self.size, (2,)))
+        object.__setattr__(self, "position", frozen_array(self.position, (2,)))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Mesh:
     """Terrain of any shape, as planning and physics know it (made by `patches`).
 
@@ -310,6 +338,8 @@ class Mesh:
         pieces: Convex solids, each the hull of corners (K, 3) in the world [m].
         supports: Flat parts that bear load.
         under: Of each support, the piece that it lies on.
+        field: What physics collides with in place of the pieces, where these leave out
+            the noise of a scan.
         friction: Coulomb coefficient.
         roughness: It is uneven by about this [m], see `Box`.
         rejected: Flat parts that bear none.
@@ -320,6 +350,7 @@ class Mesh:
     pieces: tuple[np.ndarray, ...]
     supports: tuple[Support, ...]
     under: tuple[int, ...]
+    field: HeightField | None = None
     friction: float = 0.8
     roughness: float = 0.0
     rejected: tuple[Rejected, ...] = ()

@@ -25,6 +25,7 @@ from clamber.model.description import read_xml
 from clamber.model.scans import (
     CLOUDS,
     MESHES,
+    MOST,
     UNITS,
     check_size,
     mended,
@@ -36,6 +37,7 @@ from clamber.model.scene import (
     GROUND,
     MAX_LENGTH,
     Box,
+    HeightField,
     Mesh,
     Scene,
     finite,
@@ -142,8 +144,17 @@ class HeightsFile(_Strict):
         heights = read_heights(path, *(self.range or (0.0, 1.0)))
         (vertices, faces), notes = triangles_of_heights(heights, self.size, path)
         turn = matrix_from_rpy([0.0, 0.0, self.yaw])
-        vertices = vertices @ turn.T + _place(self.position)
-        return _mesh(self, path, vertices, faces, notes)
+        place = _place(self.position)
+        vertices = vertices @ turn.T + place
+        field = None
+        if np.isfinite(heights).all() and heights.size <= MOST:
+            field = HeightField(
+                heights=heights + place[2],
+                size=np.array(self.size),
+                position=place[:2],
+                yaw=self.yaw,
+            )
+        return _mesh(self, path, vertices, faces, notes, field)
 
 
 def _place(position: Sequence[float]) -> np.ndarray:
@@ -156,6 +167,7 @@ def _mesh(
     vertices: np.ndarray,
     faces: np.ndarray,
     notes: list[str],
+    field: HeightField | None = None,
 ) -> Mesh:
     from clamber.model.patches import mesh_of  # brings SciPy and shapely with it
 
@@ -166,6 +178,7 @@ def _mesh(
         faces,
         friction=said.friction,
         roughness=said.roughness,
+        field=field,
         notes=tuple(notes),
     )
 

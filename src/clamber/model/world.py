@@ -22,7 +22,7 @@ from clamber.model.arguments import checks_types
 from clamber.model.description import read_description
 from clamber.model.records import short_repr
 from clamber.model.robot import Robot, RobotLike, has_prefix, load_robot, world_name
-from clamber.model.scene import GROUND, Scene, Support
+from clamber.model.scene import GROUND, Mesh, Scene, Support
 from clamber.model.se3 import matrix_from_quat, quat_from_yaw
 from clamber.model.terrain import SceneLike, load_scene
 
@@ -541,6 +541,8 @@ def _pairs(model: mujoco.MjModel, data: mujoco.MjData, base: int) -> np.ndarray:
     a, b = np.triu_indices(model.ngeom, 1)
     keep = ((kind[a] & meets[b]) | (kind[b] & meets[a])) != 0
     keep &= (robot[a] | robot[b]) & (weld[a] != weld[b])
+    field = model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD  # without distances
+    keep &= ~(field[a] | field[b])
     own = robot[a] & robot[b]
     excluded = np.concatenate([model.exclude_signature, [-1]])
     low, high = np.minimum(body[a], body[b]), np.maximum(body[a], body[b])
@@ -566,8 +568,18 @@ def _support_geoms(model: mujoco.MjModel, scene: Scene) -> dict[str, int]:
         for s, i in zip(m.supports, m.under, strict=True):
             names[s.name] = m.piece_name(i)
     for m in scene.meshes:
-        names |= {n: n for n in map(m.piece_name, range(len(m.pieces)))}
+        if _has_field(model, m):
+            of_it = (n for n in names if scene.owner(n) == m.name)
+            names |= dict.fromkeys(of_it, m.piece_name(0))
+        else:
+            names |= {n: n for n in map(m.piece_name, range(len(m.pieces)))}
     return {name: model.geom(geom).id for name, geom in names.items()}
+
+
+def _has_field(model: mujoco.MjModel, mesh: Mesh) -> bool:
+    """Whether a mesh is its height field in a model, not its pieces."""
+    kind = model.geom_type[model.geom(mesh.piece_name(0)).id]
+    return kind == mujoco.mjtGeom.mjGEOM_HFIELD
 
 
 def _touching(
@@ -584,7 +596,9 @@ def _touching(
     """
     index = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
     pieces = [
-        (m.piece_name(i), p) for m in scene.meshes for i, p in enumerate(m.pieces)
+        (m.piece_name(i), p)
+        for m in scene.meshes
+        for i, p in enumerate(() if _has_field(model, m) else m.pieces)
     ]
     out = {}
     for support in scene.supports:

@@ -161,10 +161,11 @@ def plan(
 
     here = task(scene, clearance)
     found = here.asked_for()
-    rough = any(b.roughness > 0 for b in scene.boxes)
+    rough = any(b.roughness > 0 for b in (*scene.boxes, *scene.meshes))
     if found.failures and start is not None and (clearance or rough):
         boxes = tuple(replace(b, roughness=0.0) for b in scene.boxes)
-        nearer = task(replace(scene, boxes=boxes), NO_EXTRA)
+        meshes = tuple(replace(m, roughness=0.0) for m in scene.meshes)
+        nearer = task(replace(scene, boxes=boxes, meshes=meshes), NO_EXTRA)
         other = nearer.asked_for()
         if not other.failures or len(other.changes) > len(found.changes):
             here, found = nearer, other

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from clamber.model.boxes import grid_triangles
 from clamber.model.records import short_repr
 
 SLICES, FEWEST_SLICES = 28, 6  # around a round geom
@@ -125,7 +126,7 @@ def geom_triangles(
         slices: Faces around a round geom.
 
     Returns:
-        None for a kind that has no surface of its own (a plane, a height field).
+        None for a kind that has no surface of its own, a plane.
     """
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     data = int(model.geom_dataid[geom])
@@ -148,12 +149,28 @@ def geom_triangles(
         mujoco.mjtGeom.mjGEOM_SDF,
     ):
         v, n, f = _mesh(model, data, keep)
+    elif kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+        v, n, f = _heights(model, data)
     else:
         return None
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, model.geom_quat[geom])
     R = R.reshape(3, 3)
     return v @ R.T + model.geom_pos[geom], n @ R.T, f
+
+
+def _heights(model: mujoco.MjModel, field: int) -> _Triangles:
+    """A height field from above, smooth between its heights."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    x, y, rise, _ = model.hfield_size[field]
+    first = int(model.hfield_adr[field])
+    heights = model.hfield_data[first : first + rows * columns]
+    heights = rise * heights.reshape(rows, columns).astype(float)
+    along = np.linspace(-x, x, columns), np.linspace(-y, y, rows)
+    v, f = grid_triangles(*along, heights)
+    down, right = np.gradient(heights, along[1], along[0])
+    n = np.stack([-right, -down, np.ones_like(heights)], axis=-1).reshape(-1, 3)
+    return v, n / np.linalg.norm(n, axis=1, keepdims=True), f
 
 
 def _slices(model: mujoco.MjModel, geom: int, deviation: float) -> int:
