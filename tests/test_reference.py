@@ -82,7 +82,7 @@ def test_it_stops_before_a_limb_leaves_and_starts_again_as_smoothly(ref, hands_p
 @pytest.mark.parametrize("distance", [1, 2, 7, 100, 1000])
 @pytest.mark.parametrize("ends", [(), ("up",), ("down",), ("up", "down")])
 def test_a_ramp_covers_its_distance_and_its_rate_is_never_above_one(distance, ends):
-    done, rate = ramped(distance, **dict.fromkeys(ends, True))
+    done, rate = ramped(distance, **{n: {"up": 0.0, "down": True}[n] for n in ends})
     assert done[-1] == distance
     assert np.all(np.diff(done) > 0)
     assert rate.min() >= 0.0

@@ -29,7 +29,7 @@ from clamber.contact.contact import Contact
 from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.execution.balance import SMOOTHING, Balance
-from clamber.execution.estimate import LOST, TOUCH, Estimate
+from clamber.execution.estimate import DEVIATION, LOST, PRESSED, TOUCH, Estimate
 from clamber.execution.events import (
     ContactMoved,
     Event,
@@ -61,7 +61,6 @@ from clamber.step.change import Failure
 from clamber.step.ik import NO_EXTRA, ExtraClearance
 from clamber.step.posture import Keyframe
 
-DEVIATION = 0.006  # [m] along the normal: the rest is planned again
 DRIFT = 0.015  # [m] along the support: the rest is planned again
 START_DRIFT = 0.010  # [m] of the start, as far as the arms reach
 ARM = 0.3  # [m] of it, by which a turn of the start counts
@@ -286,13 +285,15 @@ class Executive:
             yield from self._take(c, c)
             return True
         late = min(span.touch + round(FEEL / PHYSICS_STEP), span.end)
-        self.estimate.expect(c)
-        yield from ref.play(late, until=lambda: ref.i >= span.touch and touches(c))
+
+        def is_there() -> bool:
+            return ref.i >= span.touch and self.estimate.is_in_place(c)
+
+        self.estimate.expect(c, force=PRESSED)
+        yield from ref.play(late, until=is_there)
+        yield from ref.stop(until=is_there)
         self.estimate.expect()
-        if touches(c):
-            return False
-        yield from ref.stop()
-        if touches(c):
+        if is_there():
             return False
         yield from ref.back(span.touch)  # where the others hold the robot
         found = yield from self._probe(c)

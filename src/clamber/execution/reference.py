@@ -64,9 +64,15 @@ class Reference:
         return int(self._at[done - 1]) if done and len(self._at) else self._begin
 
     @property
+    def rate(self) -> float:
+        """At which the trajectory is being followed: 1 as planned, 0 where it is not."""
+        done = self.track.done
+        return float(self._rate[done - 1]) if 0 < done <= len(self._rate) else 0.0
+
+    @property
     def moves(self) -> bool:
         """The trajectory is being followed, and does not rest where it is."""
-        return not self._still and self._passes(self.i)
+        return self.rate > 0.0 and self._passes(self.i)
 
     def _passes(self, i: int) -> bool:
         """The trajectory does not rest at a sample."""
@@ -74,49 +80,57 @@ class Reference:
 
     def follow(self, trajectory: Trajectory, i: int) -> None:
         """Go on, from rest, at sample `i` of another trajectory."""
-        self.trajectory, self._begin, self._still = trajectory, i, True
-        self._at = np.zeros(0)  # of each row, the sample of the trajectory
+        self.trajectory, self._begin = trajectory, i
+        # Of each row, the sample of the trajectory, and how fast it is followed there.
+        self._at, self._rate = np.zeros(0), np.zeros(0)
         self._offset: tuple[np.ndarray, np.ndarray, int] | None = None
 
     def play(self, to: int, until: Callable[[], bool] | None = None) -> Actions:
         """Follow the trajectory to sample `to`, or until something happens.
 
-        From where the robot has come to rest on the way, at first more slowly.
+        From where the robot has slowed down on the way, at first more slowly.
         """
-        i = self.i
+        i, rate = self.i, self.rate
         if i < to and not (until is not None and until()):
-            if self._still and i >= 0 and self._passes(i):
-                self._load_at(i, to, up=True)
+            if rate < 1.0 and i >= 0 and self._passes(i):
+                self._load_at(i, to, up=rate)
             else:
                 self._load(self.trajectory, slice(i + 1, to + 1), plays=True)
-            self._still = False
             yield
             while self.i < to and not (until is not None and until()):
                 yield
 
-    def stop(self) -> Actions:
-        """Slow down along the trajectory, to rest before a limb leaves."""
-        if not self.moves:
+    def stop(self, until: Callable[[], bool] | None = None) -> Actions:
+        """Slow down along the trajectory, to rest before a limb leaves.
+
+        Or until something happens: then it can go on without having stopped.
+        """
+        if not self.moves or (until is not None and until()):
             return
         i, t = self.i, self.trajectory
         leaves = (x.begin for x in t.segments if x.kind == "swing" and x.begin > i)
         by = min(next(leaves, len(t.time)) - 1, i + round(0.5 * RAMP / PHYSICS_STEP))
-        self.left_plan = self._still = True
+        self.left_plan = True
         if by > i:
             self._load_at(i, by, down=True)
-            yield from self._done()
+            for _ in self._done():
+                yield
+                if until is not None and until():
+                    return
+        self._rate = np.zeros(0)
 
     def back(self, to: int) -> Actions:
         """Come to rest, and follow the trajectory back to rest at sample `to`."""
         yield from self.stop()
-        self.left_plan = self._still = True
+        self.left_plan = True
         if self.i > to:
-            self._load_at(self.i, to, up=True, down=True)
+            self._load_at(self.i, to, up=0.0, down=True)
             yield from self._done()
+            self._rate = np.zeros(0)
 
     def aside(self, t: Trajectory, until: Callable[[], bool]) -> Actions:
         """Follow another trajectory until something happens, or there and back."""
-        self.left_plan = self._still = True
+        self.left_plan = True
         self._load(t, slice(None))
         for _ in self._done():
             yield
@@ -132,12 +146,11 @@ class Reference:
 
     def hold(self, seconds: float) -> Actions:
         """Stand still."""
-        self._still = True
         steps, still = round(seconds / PHYSICS_STEP), np.zeros((1, len(self._dadr)))
         now = self.q, self.torque, self.closed
         q, torque, closed = (x[None].copy() for x in now)
-        ahead = self._ahead(np.array([self.i]))
-        self._begin_rows(q, still, torque, closed, ahead, np.zeros(0), steps)
+        ahead, none = self._ahead(np.array([self.i])), np.zeros(0)
+        self._begin_rows(q, still, torque, closed, ahead, none, none, steps)
         yield from self._done()
 
     def resume(self) -> None:
@@ -199,17 +212,18 @@ class Reference:
             q, torque, velocity = q.copy(), torque.copy(), velocity.copy()
             self._blend(at, np.ones(len(at)), q, velocity, torque)
         ahead = self._ahead(at if plays else np.full(len(q), self.i))
-        self._begin_rows(q, velocity, torque, closed, ahead, at, len(q))
+        rate = np.ones(len(at))
+        self._begin_rows(q, velocity, torque, closed, ahead, at, rate, len(q))
 
     def _load_at(
-        self, i: int, to: int, *, up: bool = False, down: bool = False
+        self, i: int, to: int, *, up: float | None = None, down: bool = False
     ) -> None:
         """Follow the trajectory at hand between two samples, slower at its ends.
 
         Args:
             i: From this sample.
             to: The last one.
-            up: From rest.
+            up: From this rate.
             down: To rest.
         """
         way = 1 if to > i else -1
@@ -228,9 +242,8 @@ class Reference:
         closed = t.contact[rows][low]
         if self._offset is not None and way == 1:
             self._blend(at, rate, q, velocity, torque)
-        self._begin_rows(
-            q, velocity, torque, closed, self._ahead(low + first), at, len(q)
-        )
+        ahead = self._ahead(low + first)
+        self._begin_rows(q, velocity, torque, closed, ahead, at, rate, len(q))
 
     def _begin_rows(
         self,
@@ -240,9 +253,11 @@ class Reference:
         closed: np.ndarray,
         ahead: np.ndarray,
         at: np.ndarray,
+        rate: np.ndarray,
         steps: int,
     ) -> None:
         self._begin, self._at = self.i, np.floor(at + 1e-9).astype(int)
+        self._rate = rate
         if self._rows:
             self._steps.append(self.track.done)
         self.track.load(q, velocity, torque, closed, ahead, steps)
@@ -287,20 +302,23 @@ class Reference:
 
 
 def ramped(
-    distance: int, *, up: bool = False, down: bool = False
+    distance: int, *, up: float | None = None, down: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples of the way done (n,) at each step, and the rate (n,) in [0, 1].
 
     Args:
         distance: The way in samples, which take a step each at the planned speed.
-        up: From rest.
+        up: From this rate.
         down: To rest.
     """
-    ramps = up + down
+    ramps = (up is not None) + down
     n = min(round(RAMP / PHYSICS_STEP), 2 * distance // max(ramps, 1)) // 2 * 2
     rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / max(n, 1))
-    rate = np.ones(distance - ramps * n // 2)
-    rate = np.concatenate([rise[: n * up], rate, rise[::-1][: n * down]])
+    first = rise[:0] if up is None else rise[rise > up]
+    last = rise[::-1] if down else rise[:0]
+    plain = distance - np.sum(first) - np.sum(last)
+    rate = np.concatenate([first, np.ones(max(round(plain), 0)), last])
+    rate *= min(distance / np.sum(rate), 1.0 / rate.max())
     done = np.cumsum(rate)
     done[-1] = distance
     return done, rate
