@@ -65,7 +65,7 @@ class Reference:
 
     @property
     def rate(self) -> float:
-        """At which the trajectory is being followed: 1 as planned, 0 where it is not."""
+        """At which the trajectory is followed: 1 as planned, 0 where it is not."""
         done = self.track.done
         return float(self._rate[done - 1]) if 0 < done <= len(self._rate) else 0.0
 
