@@ -95,8 +95,8 @@ class OpenLoop:
         self._ref = Reference(t, world)
         self._ref.follow(t, -1)
         filter_ = Estimate(plan.world, t.q[0]).filter
-        still = replace(world, robot=replace(world.robot, self_positioning=()))
-        self.core = _follower(world, filter_, self._ref, self_positioning(still))
+        held = self_positioning(world, "max")
+        self.core = _follower(world, filter_, self._ref, held)
         self.events: list[Event] = []
         self.followed: Trajectory | None = None
         final = plan.keyframes[-1].stance
@@ -169,7 +169,7 @@ class Executive:
         self.stopped = ""
         self.estimate = Estimate(plan.world, plan.trajectory.q[0])
         self._ref = Reference(plan.trajectory, plan.world)
-        ankles = self_positioning(world)
+        ankles = self_positioning(world, plan.options.speed)
         self.core = _follower(world, self.estimate.filter, self._ref, ankles)
         self._adopt(plan, plan.trajectory, 0)
         self._behaviour = self._behave()
