@@ -19,6 +19,7 @@ from clamber.execution.events import (
     KeptStance,
     Lost,
     Missing,
+    Paused,
     Replanned,
     StartsElsewhere,
     Stopped,
@@ -309,6 +310,34 @@ def test_a_start_that_is_off_is_measured_and_the_whole_plan_made_anew(hands_plan
     assert rollout.stopped == ""
     end = load(rollout, rollout.time[-1])
     assert min(end["LHand"], end["RHand"]) > LOST
+
+
+@pytest.mark.parametrize("share", [0.2, 0.45, 0.7])
+def test_it_pauses_anywhere_and_goes_on(hands_plan, share):
+    """Ten seconds on the way, also with a limb in the air; then as planned."""
+    t = hands_plan.trajectory
+    told = share * float(t.time[-1])
+    rollout = simulate(hands_plan, pause=told, disturbance=Disturbance(**EXACT))
+    assert first(rollout, Paused).time == pytest.approx(told, abs=0.011)
+    assert not rollout.fell
+    assert rollout.stopped == ""
+    assert len(rollout.ctrl) - len(t.time) == pytest.approx(10_300, abs=700)
+    stride, joints = rollout.stride, rollout.world.qadr
+    begin = round((told + 2.5) / PHYSICS_STEP / stride)
+    still = rollout.qpos[begin : begin + round(7.0 / PHYSICS_STEP / stride)]
+    assert np.abs(still[:, joints] - still[0, joints]).max() < 0.01
+    assert np.linalg.norm(still[:, :3] - still[0, :3], axis=1).max() < 0.004
+
+
+@pytest.mark.parametrize("pause", [-1.0, np.nan])
+def test_a_pause_has_a_time(hands_plan, pause):
+    with pytest.raises(InputError, match="pause"):
+        simulate(hands_plan, pause=pause)
+
+
+def test_open_loop_does_not_pause(hands_plan):
+    with pytest.raises(InputError, match="pid"):
+        simulate(hands_plan, pause=1.0, controller="pid")
 
 
 def test_torques_follow_the_mass_that_is_measured(hands_plan):

@@ -39,6 +39,7 @@ from clamber.execution.events import (
     KeptStance,
     Lost,
     Missing,
+    Paused,
     Replanned,
     StartsElsewhere,
     Stopped,
@@ -68,6 +69,7 @@ MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 0.1  # [s] the robot stands still while the rest is planned again
 SEARCHING = 1.0  # [s] ... where other contacts are looked for
+PAUSE = 10.0  # [s] that it stands where it is told to pause
 FEEL = 0.01  # [s] later than planned that a contact may be felt
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
@@ -143,20 +145,28 @@ class Executive:
         stopped: Why it stopped; empty where it did not.
     """
 
-    def __init__(self, plan: Plan, world: World, progress: Progress = silent) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        world: World,
+        progress: Progress = silent,
+        *,
+        pause: float | None = None,
+    ) -> None:
         """Follow `plan` on the servos of `world`, which is not looked at otherwise.
 
         Args:
             plan: What to do.
             world: In which it is done.
             progress: Called with stage, share and note where it plans again.
+            pause: When to slow down and stand for `PAUSE` [s]; None: never.
         """
         assert plan.trajectory is not None
         self._plan = plan
         self._report = progress
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
         self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
-        self._searches = 0
+        self._searches, self._pause = 0, pause
         self.done = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance: it has no steps to count.
         by_policy = plan.policy is not None
@@ -182,6 +192,12 @@ class Executive:
         """What to follow next; `look` once every `LOOK_STRIDE` steps."""
         if look:
             self.watch.look(self.estimate.load, self._in_use)
+            if (
+                self._pause is not None
+                and self.core.steps * PHYSICS_STEP >= self._pause
+            ):
+                self._pause, self._ref.pause = None, PAUSE
+                self._note(Paused, seconds=PAUSE)
         next(self._behaviour)
 
     def close(self) -> None:

@@ -22,6 +22,8 @@ BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 RESTS = 1e-3  # [rad/s] a trajectory that is slower rests
 RAMP = 0.15  # [s] to rest on the way, and from rest to the planned speed again
+# [m/s^2] the centre of mass slows down on average for a pause, [s] in no more than this
+BRAKING, LONGEST = 0.3, 1.2
 
 # What was commanded is written down, and commands are given, in multiples of a
 # microradian or micrometre, of what single precision holds of a rotation, 0.03 mrad/s
@@ -40,6 +42,7 @@ class Reference:
         q: (nq,); velocity: (na,) of the joints; torque: (na,) fed forward; closed:
             (nS,) bool, contacts by surface. As of the last step, in place.
         left_plan: Something else than the first trajectory was followed.
+        pause: [s] to stand still as soon as it can be, on the way; 0: go on.
     """
 
     def __init__(self, trajectory: Trajectory, world: World) -> None:
@@ -51,7 +54,7 @@ class Reference:
         self.torque, self.closed = now.torque, now.closed
         self._rows: list[tuple[np.ndarray, ...]] = []  # of the track, less q
         self._steps: list[int] = []  # that each of them was followed
-        self.left_plan = False
+        self.left_plan, self.pause = False, 0.0
         self.follow(trajectory, 0)
         self._load(trajectory, slice(1))
         self.track.advance()
@@ -98,6 +101,8 @@ class Reference:
                 self._load(self.trajectory, slice(i + 1, to + 1), plays=True)
             yield
             while self.i < to and not (until is not None and until()):
+                if self.pause > 0.0:
+                    yield from self._stand(to)
                 yield
 
     def stop(self, until: Callable[[], bool] | None = None) -> Actions:
@@ -118,6 +123,26 @@ class Reference:
                 if until is not None and until():
                     return
         self._rate = np.zeros(0)
+
+    def _stand(self, to: int) -> Actions:
+        """Pause, if the way to sample `to` is long enough to slow down on it."""
+        i = self.i
+        places = []
+        for k in (i, min(i + 10, to)):
+            self._kin.update(self.trajectory.q[k])
+            places.append(self._kin.com.copy())
+        speed = float(np.linalg.norm(places[1] - places[0])) / (10 * PHYSICS_STEP)
+        ramp = float(np.clip(self.rate * speed / BRAKING, RAMP, LONGEST))
+        by = i + round(0.5 * self.rate * ramp / PHYSICS_STEP)
+        if by >= to:
+            return
+        self.left_plan = True
+        seconds, self.pause = self.pause, 0.0
+        if by > i and self.moves:
+            self._load_at(i, by, down=True, ramp=ramp)
+            yield from self._done()
+        yield from self.hold(seconds)
+        self._load_at(self.i, to, up=0.0)
 
     def back(self, to: int) -> Actions:
         """Come to rest, and follow the trajectory back to rest at sample `to`."""
@@ -216,7 +241,13 @@ class Reference:
         self._begin_rows(q, velocity, torque, closed, ahead, at, rate, len(q))
 
     def _load_at(
-        self, i: int, to: int, *, up: float | None = None, down: bool = False
+        self,
+        i: int,
+        to: int,
+        *,
+        up: float | None = None,
+        down: bool = False,
+        ramp: float = RAMP,
     ) -> None:
         """Follow the trajectory at hand between two samples, slower at its ends.
 
@@ -225,9 +256,10 @@ class Reference:
             to: The last one.
             up: From this rate.
             down: To rest.
+            ramp: Between rest and the planned speed [s].
         """
         way = 1 if to > i else -1
-        done, rate = ramped(abs(to - i), up=up, down=down)
+        done, rate = ramped(abs(to - i), up=up, down=down, ramp=ramp)
         at = i + way * done
         t, low = self.trajectory, np.floor(at).astype(int)
         first, share = low.min(), (at - low)[:, None]
@@ -302,7 +334,7 @@ class Reference:
 
 
 def ramped(
-    distance: int, *, up: float | None = None, down: bool = False
+    distance: int, *, up: float | None = None, down: bool = False, ramp: float = RAMP
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples of the way done (n,) at each step, and the rate (n,) in [0, 1].
 
@@ -310,9 +342,10 @@ def ramped(
         distance: The way in samples, which take a step each at the planned speed.
         up: From this rate.
         down: To rest.
+        ramp: Between rest and the planned speed [s].
     """
     ramps = (up is not None) + down
-    n = min(round(RAMP / PHYSICS_STEP), 2 * distance // max(ramps, 1)) // 2 * 2
+    n = min(round(ramp / PHYSICS_STEP), 2 * distance // max(ramps, 1)) // 2 * 2
     rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / max(n, 1))
     first = rise[:0] if up is None else rise[rise > up]
     last = rise[::-1] if down else rise[:0]
