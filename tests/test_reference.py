@@ -89,8 +89,8 @@ def test_slowing_down_it_goes_on_without_having_stopped(ref, hands_plan):
     rate = ref.rate
     assert 0.2 < rate < 0.95
     q += [ref.q.copy() for _ in steps(ref, ref.play(begin + 300))]
-    assert ref.rate == 1.0
-    assert np.array_equal(ref.velocity, t.v[begin + 300, dadr])
+    assert ref.rate == pytest.approx(1.0, abs=0.01)
+    assert np.allclose(ref.velocity, t.v[begin + 300, dadr], rtol=0.01)
     # No step in velocity where it turns: it is never slower than it was there.
     speed = np.abs(np.diff(np.array(q)[:, hands_plan.world.qadr], axis=0)).max(axis=1)
     planned = np.abs(t.v[begin : begin + 300, dadr]).max(axis=1) * PHYSICS_STEP

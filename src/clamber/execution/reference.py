@@ -7,6 +7,7 @@ yields; it goes on once that is done, or earlier where something may have happen
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Generator
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 RESTS = 1e-3  # [rad/s] a trajectory that is slower rests
 RAMP = 0.15  # [s] to rest on the way, and from rest to the planned speed again
+FULL = 0.99  # rate above which the trajectory is followed sample by sample
 # [m/s^2] the centre of mass slows down on average for a pause, [s] in no more than this
 BRAKING, LONGEST = 0.3, 1.2
 
@@ -63,8 +65,13 @@ class Reference:
     @property
     def i(self) -> int:
         """The sample of the trajectory that was reached."""
+        return int(np.floor(self._place + 1e-9))
+
+    @property
+    def _place(self) -> float:
+        """The same, between samples where it is followed more slowly."""
         done = self.track.done
-        return int(self._at[done - 1]) if done and len(self._at) else self._begin
+        return float(self._at[done - 1]) if done and len(self._at) else self._begin
 
     @property
     def rate(self) -> float:
@@ -95,8 +102,8 @@ class Reference:
         """
         i, rate = self.i, self.rate
         if i < to and not (until is not None and until()):
-            if rate < 1.0 and i >= 0 and self._passes(i):
-                self._load_at(i, to, up=rate)
+            if rate < FULL and i >= 0 and self._passes(i):
+                self._load_at(to, up=rate)
             else:
                 self._load(self.trajectory, slice(i + 1, to + 1), plays=True)
             yield
@@ -117,7 +124,7 @@ class Reference:
         by = min(next(leaves, len(t.time)) - 1, i + round(0.5 * RAMP / PHYSICS_STEP))
         self.left_plan = True
         if by > i:
-            self._load_at(i, by, down=True)
+            self._load_at(by, down=True)
             for _ in self._done():
                 yield
                 if until is not None and until():
@@ -139,17 +146,17 @@ class Reference:
         self.left_plan = True
         seconds, self.pause = self.pause, 0.0
         if by > i and self.moves:
-            self._load_at(i, by, down=True, ramp=ramp)
+            self._load_at(by, down=True, ramp=ramp)
             yield from self._done()
         yield from self.hold(seconds)
-        self._load_at(self.i, to, up=0.0)
+        self._load_at(to, up=0.0)
 
     def back(self, to: int) -> Actions:
         """Come to rest, and follow the trajectory back to rest at sample `to`."""
         yield from self.stop()
         self.left_plan = True
         if self.i > to:
-            self._load_at(self.i, to, up=0.0, down=True)
+            self._load_at(to, up=0.0, down=True)
             yield from self._done()
             self._rate = np.zeros(0)
 
@@ -242,22 +249,21 @@ class Reference:
 
     def _load_at(
         self,
-        i: int,
         to: int,
         *,
         up: float | None = None,
         down: bool = False,
         ramp: float = RAMP,
     ) -> None:
-        """Follow the trajectory at hand between two samples, slower at its ends.
+        """Follow the trajectory at hand to a sample, slower at the ends of the way.
 
         Args:
-            i: From this sample.
-            to: The last one.
+            to: The sample.
             up: From this rate.
             down: To rest.
             ramp: Between rest and the planned speed [s].
         """
+        i = self._place
         way = 1 if to > i else -1
         done, rate = ramped(abs(to - i), up=up, down=down, ramp=ramp)
         at = i + way * done
@@ -288,7 +294,7 @@ class Reference:
         rate: np.ndarray,
         steps: int,
     ) -> None:
-        self._begin, self._at = self.i, np.floor(at + 1e-9).astype(int)
+        self._begin, self._at = self._place, at
         self._rate = rate
         if self._rows:
             self._steps.append(self.track.done)
@@ -334,7 +340,7 @@ class Reference:
 
 
 def ramped(
-    distance: int, *, up: float | None = None, down: bool = False, ramp: float = RAMP
+    distance: float, *, up: float | None = None, down: bool = False, ramp: float = RAMP
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples of the way done (n,) at each step, and the rate (n,) in [0, 1].
 
@@ -345,12 +351,12 @@ def ramped(
         ramp: Between rest and the planned speed [s].
     """
     ramps = (up is not None) + down
-    n = min(round(ramp / PHYSICS_STEP), 2 * distance // max(ramps, 1)) // 2 * 2
+    n = min(round(ramp / PHYSICS_STEP), int(2 * distance) // max(ramps, 1)) // 2 * 2
     rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / max(n, 1))
     first = rise[:0] if up is None else rise[rise > up]
     last = rise[::-1] if down else rise[:0]
-    plain = distance - np.sum(first) - np.sum(last)
-    rate = np.concatenate([first, np.ones(max(round(plain), 0)), last])
+    plain = distance - float(np.sum(first) + np.sum(last))
+    rate = np.concatenate([first, np.ones(max(math.ceil(plain), 0)), last])
     rate *= min(distance / np.sum(rate), 1.0 / rate.max())
     done = np.cumsum(rate)
     done[-1] = distance
