@@ -651,7 +651,8 @@ def test_all_surfaces_that_are_loaded_at_the_end_are_rested_on(fast_plan):
 def test_ankles_position_themselves_while_both_arms_are_loaded(fast_plan):
     """Then their command goes with the measured angle: a deviation is let alone."""
     slow = timed(fast_plan.world, fast_plan.changes, 0.3)
-    fast_plan = replace(fast_plan, trajectory=slow)
+    options = replace(fast_plan.options, speed=0.3)
+    fast_plan = replace(fast_plan, trajectory=slow, options=options)
     told, w = Told(fast_plan), fast_plan.world
     feet = self_positioning_joints(w)
     off = np.where(np.any(list(feet.values()), axis=0), 0.01, 0.0)

@@ -23,6 +23,7 @@ BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 RESTS = 1e-3  # [rad/s] a trajectory that is slower rests
 RAMP = 0.15  # [s] to rest on the way, and from rest to the planned speed again
+UNHURRIED = 0.3  # [s] of a trajectory: less of it is gone back more slowly
 FULL = 0.99  # rate above which the trajectory is followed sample by sample
 # [m/s^2] the centre of mass slows down on average for a pause, [s] in no more than this
 BRAKING, LONGEST = 0.3, 1.2
@@ -112,10 +113,17 @@ class Reference:
                     yield from self._stand(to)
                 yield
 
-    def stop(self, until: Callable[[], bool] | None = None) -> Actions:
+    def stop(
+        self, until: Callable[[], bool] | None = None, push: int | None = None
+    ) -> Actions:
         """Slow down along the trajectory, to rest before a limb leaves.
 
         Or until something happens: then it can go on without having stopped.
+
+        Args:
+            until: Whether it has.
+            push: Sample whose torques are fed forward meanwhile: where a contact is
+                missing, later ones count on it.
         """
         if not self.moves or (until is not None and until()):
             return
@@ -124,7 +132,7 @@ class Reference:
         by = min(next(leaves, len(t.time)) - 1, i + round(0.5 * RAMP / PHYSICS_STEP))
         self.left_plan = True
         if by > i:
-            self._load_at(by, down=True)
+            self._load_at(by, down=True, push=push)
             for _ in self._done():
                 yield
                 if until is not None and until():
@@ -152,11 +160,16 @@ class Reference:
         self._load_at(to, up=0.0)
 
     def back(self, to: int) -> Actions:
-        """Come to rest, and follow the trajectory back to rest at sample `to`."""
+        """Come to rest, and follow the trajectory back to rest at sample `to`.
+
+        Fed forward are the torques of `to`: contacts made after it may be missing.
+        """
         yield from self.stop()
         self.left_plan = True
         if self.i > to:
-            self._load_at(to, up=0.0, down=True)
+            # To turn round at once would throw the robot over its toes.
+            pace = min(1.0, max((self.i - to) * PHYSICS_STEP / UNHURRIED, 0.25))
+            self._load_at(to, up=0.0, down=True, pace=pace, push=to)
             yield from self._done()
             self._rate = np.zeros(0)
 
@@ -254,6 +267,8 @@ class Reference:
         up: float | None = None,
         down: bool = False,
         ramp: float = RAMP,
+        pace: float = 1.0,
+        push: int | None = None,
     ) -> None:
         """Follow the trajectory at hand to a sample, slower at the ends of the way.
 
@@ -262,10 +277,14 @@ class Reference:
             up: From this rate.
             down: To rest.
             ramp: Between rest and the planned speed [s].
+            pace: Share of that at most.
+            push: Sample whose torques are fed forward all the way; None: of each.
         """
         i = self._place
         way = 1 if to > i else -1
-        done, rate = ramped(abs(to - i), up=up, down=down, ramp=ramp)
+        done, rate = ramped(abs(to - i) / pace, up=up, down=down, ramp=ramp)
+        done, rate = pace * done, pace * rate
+        done[-1] = abs(to - i)
         at = i + way * done
         t, low = self.trajectory, np.floor(at).astype(int)
         first, share = low.min(), (at - low)[:, None]
@@ -276,6 +295,8 @@ class Reference:
             return x[low] + share * (x[high] - x[low])
 
         q, v, torque = (between(x[rows]) for x in (t.q, t.v, t.tau))
+        if push is not None:
+            torque = np.tile(t.tau[push], (len(torque), 1))
         velocity = way * rate[:, None] * v[:, self._dadr]
         closed = t.contact[rows][low]
         if self._offset is not None and way == 1:
