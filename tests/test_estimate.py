@@ -10,9 +10,11 @@ import pytest
 
 from clamber.contact.steps import MOVED
 from clamber.execution.estimate import (
+    DEVIATION,
     FORCE_SMOOTHING,
     LOST,
     NEAR,
+    PRESSED,
     TOUCH,
     Estimate,
 )
@@ -118,6 +120,24 @@ def test_a_touch_is_a_normal_force_near_the_planned_place(
 ):
     c = placed(estimate, hands_plan, 1, up, side, LHand=force)
     assert estimate.touches(c) == touches
+
+
+@pytest.mark.parametrize(
+    ("force", "up", "side", "there"),
+    [
+        (1.1 * PRESSED, 0.0, 0.0, True),
+        (0.9 * PRESSED, 0.0, 0.0, False),
+        (1.1 * PRESSED, -0.9 * DEVIATION, 0.0, True),
+        (50.0, -1.2 * DEVIATION, 0.0, False),
+        (50.0, 1.2 * DEVIATION, 0.0, False),
+        (50.0, 0.0, 1.1 * NEAR, False),
+    ],
+)
+def test_a_contact_in_place_may_be_pressed_lightly(
+    estimate, hands_plan, force, up, side, there
+):
+    c = placed(estimate, hands_plan, 1, up, side, LHand=force)
+    assert estimate.is_in_place(c) == there
 
 
 def test_what_is_probed_for_may_be_met_further_aside(estimate, hands_plan):

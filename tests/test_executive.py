@@ -19,6 +19,7 @@ from clamber.execution.events import (
     KeptStance,
     Lost,
     Missing,
+    Paused,
     Replanned,
     StartsElsewhere,
     Stopped,
@@ -311,6 +312,34 @@ def test_a_start_that_is_off_is_measured_and_the_whole_plan_made_anew(hands_plan
     assert min(end["LHand"], end["RHand"]) > LOST
 
 
+@pytest.mark.parametrize("share", [0.2, 0.45, 0.7])
+def test_it_pauses_anywhere_and_goes_on(hands_plan, share):
+    """Ten seconds on the way, also with a limb in the air; then as planned."""
+    t = hands_plan.trajectory
+    told = share * float(t.time[-1])
+    rollout = simulate(hands_plan, pause=told, disturbance=Disturbance(**EXACT))
+    assert first(rollout, Paused).time == pytest.approx(told, abs=0.011)
+    assert not rollout.fell
+    assert rollout.stopped == ""
+    assert len(rollout.ctrl) - len(t.time) == pytest.approx(10_300, abs=700)
+    stride, joints = rollout.stride, rollout.world.qadr
+    begin = round((told + 2.5) / PHYSICS_STEP / stride)
+    still = rollout.qpos[begin : begin + round(7.0 / PHYSICS_STEP / stride)]
+    assert np.abs(still[:, joints] - still[0, joints]).max() < 0.01
+    assert np.linalg.norm(still[:, :3] - still[0, :3], axis=1).max() < 0.004
+
+
+@pytest.mark.parametrize("pause", [-1.0, np.nan])
+def test_a_pause_has_a_time(hands_plan, pause):
+    with pytest.raises(InputError, match="pause"):
+        simulate(hands_plan, pause=pause)
+
+
+def test_open_loop_does_not_pause(hands_plan):
+    with pytest.raises(InputError, match="pid"):
+        simulate(hands_plan, pause=1.0, controller="pid")
+
+
 def test_torques_follow_the_mass_that_is_measured(hands_plan):
     rollout = run(hands_plan, mass=1.1, **EXACT)
     event = first(rollout, Heavier)
@@ -318,7 +347,7 @@ def test_torques_follow_the_mass_that_is_measured(hands_plan):
     assert event.factor == pytest.approx(1.1, abs=0.01)
     assert rollout.stopped == ""
     # The feed-forward of a compliant joint is all of its torque while it is still.
-    w, t = rollout.world, rollout.followed
+    w, t = rollout.world, rollout.followed or hands_plan.trajectory
     k = round(event.time / PHYSICS_STEP) + 2
     j = int(np.flatnonzero((w.ki == 0) & (np.abs(t.tau[k]) > 1.0))[0])
     u = rollout.ctrl[k, w.model.actuator(w.joints[j]).id]
@@ -622,7 +651,8 @@ def test_all_surfaces_that_are_loaded_at_the_end_are_rested_on(fast_plan):
 def test_ankles_position_themselves_while_both_arms_are_loaded(fast_plan):
     """Then their command goes with the measured angle: a deviation is let alone."""
     slow = timed(fast_plan.world, fast_plan.changes, 0.3)
-    fast_plan = replace(fast_plan, trajectory=slow)
+    options = replace(fast_plan.options, speed=0.3)
+    fast_plan = replace(fast_plan, trajectory=slow, options=options)
     told, w = Told(fast_plan), fast_plan.world
     feet = self_positioning_joints(w)
     off = np.where(np.any(list(feet.values()), axis=0), 0.01, 0.0)

@@ -79,10 +79,58 @@ def test_it_stops_before_a_limb_leaves_and_starts_again_as_smoothly(ref, hands_p
     assert np.array_equal(rows[-1], t.v[i + 300, hands_plan.world.dadr])
 
 
+def test_slowing_down_it_goes_on_without_having_stopped(ref, hands_plan):
+    t, dadr = hands_plan.trajectory, hands_plan.world.dadr
+    begin = next(x.begin for x in t.segments if x.kind == "swing") + 200
+    exhaust(ref, ref.play(begin))
+    q = [ref.q.copy()]
+    for _ in steps(ref, ref.stop(until=lambda: ref.i >= begin + 40)):
+        q.append(ref.q.copy())
+    rate = ref.rate
+    assert 0.2 < rate < 0.95
+    q += [ref.q.copy() for _ in steps(ref, ref.play(begin + 300))]
+    assert ref.rate == pytest.approx(1.0, abs=0.01)
+    assert np.allclose(ref.velocity, t.v[begin + 300, dadr], rtol=0.01)
+    # No step in velocity where it turns: it is never slower than it was there.
+    speed = np.abs(np.diff(np.array(q)[:, hands_plan.world.qadr], axis=0)).max(axis=1)
+    planned = np.abs(t.v[begin : begin + 300, dadr]).max(axis=1) * PHYSICS_STEP
+    assert speed[20:].min() > 0.9 * rate * planned.min()
+    assert exhaust(ref, ref.stop(until=lambda: True)) == 0  # it has happened already
+
+
+def test_a_pause_is_slowed_down_for_and_gone_on_from(ref, hands_plan):
+    t, dadr = hands_plan.trajectory, hands_plan.world.dadr
+    (begin, end), *_ = [(x.begin, x.end) for x in t.segments if x.kind == "swing"]
+    exhaust(ref, ref.play(begin))
+    ref.pause = 0.5
+    rows = [ref.velocity.copy() for _ in steps(ref, ref.play(end))]
+    still = [not v.any() for v in rows]
+    assert sum(still) == 500
+    first = still.index(True)
+    assert all(still[first : first + 500])
+    assert np.abs(rows[first - 1]).max() < 0.01
+    assert np.abs(rows[first + 500]).max() < 0.01
+    assert ref.pause == 0.0
+    assert ref.i == end
+    assert np.array_equal(ref.velocity, t.v[end, dadr])
+    assert ref.left_plan
+
+
+@pytest.mark.parametrize("distance", [1, 2, 7, 100, 1000])
+@pytest.mark.parametrize("rate", [0.1, 0.5, 0.9])
+def test_a_ramp_goes_on_from_any_rate(distance, rate):
+    done, rates = ramped(distance, up=rate)
+    assert done[-1] == distance
+    assert np.all(np.diff(rates) >= 0)
+    if distance > 100:
+        assert rates[0] == pytest.approx(rate, abs=0.03)
+        assert rates[-1] == pytest.approx(1.0, abs=0.01)
+
+
 @pytest.mark.parametrize("distance", [1, 2, 7, 100, 1000])
 @pytest.mark.parametrize("ends", [(), ("up",), ("down",), ("up", "down")])
 def test_a_ramp_covers_its_distance_and_its_rate_is_never_above_one(distance, ends):
-    done, rate = ramped(distance, **dict.fromkeys(ends, True))
+    done, rate = ramped(distance, **{n: {"up": 0.0, "down": True}[n] for n in ends})
     assert done[-1] == distance
     assert np.all(np.diff(done) > 0)
     assert rate.min() >= 0.0

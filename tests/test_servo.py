@@ -211,13 +211,21 @@ def test_ankles_are_those_of_each_foot(demo_plan):
     assert self_positioning_joints(plain) == {}
     nothing = np.zeros(len(world.surfaces), dtype=bool)
     on = ~nothing
-    assert not self_positioning(plain).share(on, on, on).any()
+    assert not self_positioning(plain, 0.3).share(on, on, on).any()
+
+
+@pytest.mark.parametrize(
+    ("speed", "acts"), [(0.05, True), (0.6, False), ("max", False)]
+)
+def test_in_fast_motion_ankles_are_held(demo_plan, speed, acts):
+    on = np.ones(len(demo_plan.world.surfaces), dtype=bool)
+    assert self_positioning(demo_plan.world, speed).share(on, on, on).any() == acts
 
 
 def test_ankles_position_themselves_only_while_both_arms_are_loaded(demo_plan):
     """Eased in and out; before a foot steps its ankle is held, the other goes on."""
     world = demo_plan.world
-    ankles, feet = self_positioning(world), self_positioning_joints(world)
+    ankles, feet = self_positioning(world, 0.3), self_positioning_joints(world)
     free = np.any(list(feet.values()), axis=0)
     down = np.ones(len(world.surfaces), dtype=bool)
     n = round(EASING / PHYSICS_STEP)

@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import linprog
 
 from clamber.planning.timing import (
+    FASTEST,
     SMOOTHING,
-    TOUCH_SPEED,
     Course,
     inertia_along,
     sample_law,
@@ -218,7 +218,7 @@ def test_a_contact_is_made_gently(demo_plan, demo_kinematics, knee_phases, fast)
         heights.append((p - made.position)[2])
     heights = np.array(heights)
     near = np.flatnonzero(heights > 0.006)[-1]
-    assert np.abs(np.diff(heights[near:])).max() * RATE < 1.3 * TOUCH_SPEED
+    assert np.abs(np.diff(heights[near:])).max() * RATE < 1.3 * FASTEST.touch_speed
 
 
 def test_it_is_faster_than_any_limit_and_the_same_every_time(

@@ -5,6 +5,7 @@ namespace clamber {
 namespace {
 
 constexpr double SPARED_ARM = 0.004;  // [m] times the weight: torque not counted on
+constexpr double HELD_SHARE = 0.5;  // of friction that is made use of, where that will do
 constexpr double LEAST_SHARE = 0.25;  // of the effort limits that is, all the same
 
 }  // namespace
@@ -100,11 +101,16 @@ TorqueView Holding::torque() const {
 
 double Holding::residual() { return statics_.residual(points(), load(), torque()); }
 
-bool Holding::torques_with(const TorqueView& torque, const double* price, double* tau) {
+bool Holding::torques_with(const TorqueView& torque, const double* price, double share,
+                           double* tau) {
     forces_.assign(points_.size(), {});
-    statics_.contact_forces(points(), load(), torque, price,
-                            reinterpret_cast<double (*)[3]>(forces_.data()));
-    bool within = true;
+    used_.clear();
+    for (const double mu : mu_) used_.push_back(share * mu);
+    ContactPointsView points = this->points();
+    points.mu = used_.data();
+    const double left = statics_.contact_forces(
+        points, load(), torque, price, reinterpret_cast<double (*)[3]>(forces_.data()));
+    bool within = left < BALANCE_TOL;
     for (std::size_t j = 0; j < limits_.size(); ++j) {
         const int d = model_.dadr[j];
         tau[j] = gravity_[d];
@@ -123,7 +129,9 @@ void Holding::torques(const double* price, double* tau) {
         for (const int i : owner_) price_.push_back(price[i]);
         each = price_.data();
     }
-    if (!torques_with(TorqueView{}, each, tau)) torques_with(torque(), each, tau);
+    if (!torques_with(TorqueView{}, each, HELD_SHARE, tau) &&
+        !torques_with(TorqueView{}, each, 1.0, tau))
+        torques_with(torque(), each, 1.0, tau);
     for (std::size_t j = 0; j < limits_.size(); ++j)
         tau[j] = std::min(std::max(tau[j], -model_.tau_max[j]), model_.tau_max[j]);
 }

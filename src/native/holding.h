@@ -44,14 +44,14 @@ class Holding {
     const std::vector<int>& owners() const { return owner_; }  // contact of each point
 
   private:
-    bool torques_with(const TorqueView& torque, const double* price, double* tau);
+    bool torques_with(const TorqueView& torque, const double* price, double share, double* tau);
 
     const Model& model_;
     Statics statics_;
     Vec3 com_;
     double wrench_[6];
     std::vector<std::array<double, 3>> points_, normals_, forces_;
-    std::vector<double> mu_, jacobian_, gravity_, limits_, price_;
+    std::vector<double> mu_, used_, jacobian_, gravity_, limits_, price_;
     std::vector<int> owner_;
 };
 

@@ -374,6 +374,8 @@ class SimulateCommand:
     """A run folder that holds a plan."""
     scene: Annotated[Path | None, shown("TRUTH")] = None
     """The scene.yaml that physics runs, where it is not the planned one."""
+    pause: Annotated[float | None, shown("SECONDS")] = None
+    """When the robot is told to slow down and stand for 10 s, before it goes on."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     output: Printed
 
@@ -384,7 +386,7 @@ class SimulateCommand:
         stages = Track(*EXECUTION)
         with self.output.progress(stages) as show, filling(self.run_folder):
             done = self.execution.simulate(
-                plan, self.run_folder, clock.watching(show), self.scene
+                plan, self.run_folder, clock.watching(show), self.scene, self.pause
             )
             _save_timings(self.run_folder, clock)
         return conclude(self.output, self.run_folder, plan, done)

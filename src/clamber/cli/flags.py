@@ -209,7 +209,12 @@ class ExecutionFlags:
     """What the planner does not know of the true world."""
 
     def simulate(
-        self, plan: clamber.Plan, folder: Path, report: Progress, truth: Path | None
+        self,
+        plan: clamber.Plan,
+        folder: Path,
+        report: Progress,
+        truth: Path | None,
+        pause: float | None = None,
     ) -> tuple[clamber.Rollout, clamber.Verdict] | None:
         """Simulate, judge and save; None where there is nothing to simulate."""
         if plan.trajectory is None:
@@ -219,6 +224,7 @@ class ExecutionFlags:
             controller=self.controller,
             disturbance=self.disturb,
             true_scene=None if truth is None else clamber.load_scene(truth),
+            pause=pause,
             progress=report,
         )
         report("save run", 0.0, "")

@@ -25,11 +25,13 @@ from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.start import measured_contact
 
 TOUCH = 10.0  # [N] normal force that is a contact
+PRESSED = 4.0  # [N] ... where it was planned: six times the noise that is left of it
 LOST = 1.5  # [N] a contact of the stance that carries less is lost
 FORCE_SMOOTHING = 0.03  # [s] time constant of the forces
 POSE_SMOOTHING = 0.01  # [s] ... and of the measured posture: it must not lag a touch
 TILTED = 0.35  # [rad] a sole that is more so touches with a corner
 NEAR = 0.06  # [m] sideways from the planned place, a touch is that contact
+DEVIATION = 0.006  # [m] along the normal: a contact is not where it was planned
 
 
 class Estimate:
@@ -64,11 +66,11 @@ class Estimate:
         """Take in the measurement of one physics step."""
         self.filter.update(m.q, m.force)
 
-    def expect(self, *contacts: Contact) -> None:
-        """Have a decision taken at once where a surface of these is pressed."""
+    def expect(self, *contacts: Contact, force: float = TOUCH) -> None:
+        """Have a decision taken at once where a surface of these is pressed so [N]."""
         rows = [self.row(c.surface) for c in contacts]
         normals = [self.world.supports[c.support].normal for c in contacts]
-        self.filter.watch(rows, np.array(normals).reshape(-1, 3), TOUCH)
+        self.filter.watch(rows, np.array(normals).reshape(-1, 3), force)
 
     def row(self, surface: str) -> int:
         """Of a surface in the forces."""
@@ -98,6 +100,13 @@ class Estimate:
             return False
         up, side = self.deviation(c)
         return side < aside and abs(up) < REACH + 0.02
+
+    def is_in_place(self, c: Contact) -> bool:
+        """Pressed as little as can be told, where the contact was planned."""
+        if self.force(c) < PRESSED:
+            return False
+        up, side = self.deviation(c)
+        return side < NEAR and abs(up) < DEVIATION
 
     def substitute(self, c: Contact) -> Contact | None:
         """The contact of another surface of the limb that is loaded in place of `c`."""

@@ -72,6 +72,18 @@ class ContactMoved(Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Paused(Event):
+    """The robot was told to slow down and stand.
+
+    Attributes:
+        seconds: That it stands.
+    """
+
+    says = "told to pause: slowing down, standing for {seconds:.0f} s"
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Missing(Event):
     """A contact to be made was probed for, `depth` deep, and not found."""
 

@@ -29,7 +29,7 @@ from clamber.contact.contact import Contact
 from clamber.contact.steps import split_steps
 from clamber.errors import InputError, Status
 from clamber.execution.balance import SMOOTHING, Balance
-from clamber.execution.estimate import LOST, TOUCH, Estimate
+from clamber.execution.estimate import DEVIATION, LOST, PRESSED, TOUCH, Estimate
 from clamber.execution.events import (
     ContactMoved,
     Event,
@@ -39,6 +39,7 @@ from clamber.execution.events import (
     KeptStance,
     Lost,
     Missing,
+    Paused,
     Replanned,
     StartsElsewhere,
     Stopped,
@@ -61,7 +62,6 @@ from clamber.step.change import Failure
 from clamber.step.ik import NO_EXTRA, ExtraClearance
 from clamber.step.posture import Keyframe
 
-DEVIATION = 0.006  # [m] along the normal: the rest is planned again
 DRIFT = 0.015  # [m] along the support: the rest is planned again
 START_DRIFT = 0.010  # [m] of the start, as far as the arms reach
 ARM = 0.3  # [m] of it, by which a turn of the start counts
@@ -69,6 +69,7 @@ MASS_CHANGE = 0.02  # share: torques are scaled
 LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 0.1  # [s] the robot stands still while the rest is planned again
 SEARCHING = 1.0  # [s] ... where other contacts are looked for
+PAUSE = 10.0  # [s] that it stands where it is told to pause
 FEEL = 0.01  # [s] later than planned that a contact may be felt
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
@@ -96,8 +97,8 @@ class OpenLoop:
         self._ref = Reference(t, world)
         self._ref.follow(t, -1)
         filter_ = Estimate(plan.world, t.q[0]).filter
-        still = replace(world, robot=replace(world.robot, self_positioning=()))
-        self.core = _follower(world, filter_, self._ref, self_positioning(still))
+        held = self_positioning(world, "max")
+        self.core = _follower(world, filter_, self._ref, held)
         self.events: list[Event] = []
         self.followed: Trajectory | None = None
         final = plan.keyframes[-1].stance
@@ -144,20 +145,28 @@ class Executive:
         stopped: Why it stopped; empty where it did not.
     """
 
-    def __init__(self, plan: Plan, world: World, progress: Progress = silent) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        world: World,
+        progress: Progress = silent,
+        *,
+        pause: float | None = None,
+    ) -> None:
         """Follow `plan` on the servos of `world`, which is not looked at otherwise.
 
         Args:
             plan: What to do.
             world: In which it is done.
             progress: Called with stage, share and note where it plans again.
+            pause: When to slow down and stand for `PAUSE` [s]; None: never.
         """
         assert plan.trajectory is not None
         self._plan = plan
         self._report = progress
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
         self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
-        self._searches = 0
+        self._searches, self._pause = 0, pause
         self.done = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance: it has no steps to count.
         by_policy = plan.policy is not None
@@ -170,7 +179,7 @@ class Executive:
         self.stopped = ""
         self.estimate = Estimate(plan.world, plan.trajectory.q[0])
         self._ref = Reference(plan.trajectory, plan.world)
-        ankles = self_positioning(world)
+        ankles = self_positioning(world, plan.options.speed)
         self.core = _follower(world, self.estimate.filter, self._ref, ankles)
         self._adopt(plan, plan.trajectory, 0)
         self._behaviour = self._behave()
@@ -183,6 +192,12 @@ class Executive:
         """What to follow next; `look` once every `LOOK_STRIDE` steps."""
         if look:
             self.watch.look(self.estimate.load, self._in_use)
+            if (
+                self._pause is not None
+                and self.core.steps * PHYSICS_STEP >= self._pause
+            ):
+                self._pause, self._ref.pause = None, PAUSE
+                self._note(Paused, seconds=PAUSE)
         next(self._behaviour)
 
     def close(self) -> None:
@@ -286,13 +301,15 @@ class Executive:
             yield from self._take(c, c)
             return True
         late = min(span.touch + round(FEEL / PHYSICS_STEP), span.end)
-        self.estimate.expect(c)
-        yield from ref.play(late, until=lambda: ref.i >= span.touch and touches(c))
+
+        def is_there() -> bool:
+            return ref.i >= span.touch and self.estimate.is_in_place(c)
+
+        self.estimate.expect(c, force=PRESSED)
+        yield from ref.play(late, until=is_there)
+        yield from ref.stop(until=is_there, push=span.touch)
         self.estimate.expect()
-        if touches(c):
-            return False
-        yield from ref.stop()
-        if touches(c):
+        if is_there():
             return False
         yield from ref.back(span.touch)  # where the others hold the robot
         found = yield from self._probe(c)

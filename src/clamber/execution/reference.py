@@ -7,6 +7,7 @@ yields; it goes on once that is done, or earlier where something may have happen
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Generator
 from dataclasses import replace
 
@@ -22,6 +23,10 @@ BLEND = 0.3  # [s] back to a trajectory that was left
 AHEAD = 1.0  # [s] before a foot steps, its ankle is held again
 RESTS = 1e-3  # [rad/s] a trajectory that is slower rests
 RAMP = 0.15  # [s] to rest on the way, and from rest to the planned speed again
+UNHURRIED = 0.3  # [s] of a trajectory: less of it is gone back more slowly
+FULL = 0.99  # rate above which the trajectory is followed sample by sample
+# [m/s^2] the centre of mass slows down on average for a pause, [s] in no more than this
+BRAKING, LONGEST = 0.3, 1.2
 
 # What was commanded is written down, and commands are given, in multiples of a
 # microradian or micrometre, of what single precision holds of a rotation, 0.03 mrad/s
@@ -40,6 +45,7 @@ class Reference:
         q: (nq,); velocity: (na,) of the joints; torque: (na,) fed forward; closed:
             (nS,) bool, contacts by surface. As of the last step, in place.
         left_plan: Something else than the first trajectory was followed.
+        pause: [s] to stand still as soon as it can be, on the way; 0: go on.
     """
 
     def __init__(self, trajectory: Trajectory, world: World) -> None:
@@ -51,7 +57,7 @@ class Reference:
         self.torque, self.closed = now.torque, now.closed
         self._rows: list[tuple[np.ndarray, ...]] = []  # of the track, less q
         self._steps: list[int] = []  # that each of them was followed
-        self.left_plan = False
+        self.left_plan, self.pause = False, 0.0
         self.follow(trajectory, 0)
         self._load(trajectory, slice(1))
         self.track.advance()
@@ -60,13 +66,24 @@ class Reference:
     @property
     def i(self) -> int:
         """The sample of the trajectory that was reached."""
+        return int(np.floor(self._place + 1e-9))
+
+    @property
+    def _place(self) -> float:
+        """The same, between samples where it is followed more slowly."""
         done = self.track.done
-        return int(self._at[done - 1]) if done and len(self._at) else self._begin
+        return float(self._at[done - 1]) if done and len(self._at) else self._begin
+
+    @property
+    def rate(self) -> float:
+        """At which the trajectory is followed: 1 as planned, 0 where it is not."""
+        done = self.track.done
+        return float(self._rate[done - 1]) if 0 < done <= len(self._rate) else 0.0
 
     @property
     def moves(self) -> bool:
         """The trajectory is being followed, and does not rest where it is."""
-        return not self._still and self._passes(self.i)
+        return self.rate > 0.0 and self._passes(self.i)
 
     def _passes(self, i: int) -> bool:
         """The trajectory does not rest at a sample."""
@@ -74,49 +91,91 @@ class Reference:
 
     def follow(self, trajectory: Trajectory, i: int) -> None:
         """Go on, from rest, at sample `i` of another trajectory."""
-        self.trajectory, self._begin, self._still = trajectory, i, True
-        self._at = np.zeros(0)  # of each row, the sample of the trajectory
+        self.trajectory, self._begin = trajectory, i
+        # Of each row, the sample of the trajectory, and how fast it is followed there.
+        self._at, self._rate = np.zeros(0), np.zeros(0)
         self._offset: tuple[np.ndarray, np.ndarray, int] | None = None
 
     def play(self, to: int, until: Callable[[], bool] | None = None) -> Actions:
         """Follow the trajectory to sample `to`, or until something happens.
 
-        From where the robot has come to rest on the way, at first more slowly.
+        From where the robot has slowed down on the way, at first more slowly.
         """
-        i = self.i
+        i, rate = self.i, self.rate
         if i < to and not (until is not None and until()):
-            if self._still and i >= 0 and self._passes(i):
-                self._load_at(i, to, up=True)
+            if rate < FULL and i >= 0 and self._passes(i):
+                self._load_at(to, up=rate)
             else:
                 self._load(self.trajectory, slice(i + 1, to + 1), plays=True)
-            self._still = False
             yield
             while self.i < to and not (until is not None and until()):
+                if self.pause > 0.0:
+                    yield from self._stand(to)
                 yield
 
-    def stop(self) -> Actions:
-        """Slow down along the trajectory, to rest before a limb leaves."""
-        if not self.moves:
+    def stop(
+        self, until: Callable[[], bool] | None = None, push: int | None = None
+    ) -> Actions:
+        """Slow down along the trajectory, to rest before a limb leaves.
+
+        Or until something happens: then it can go on without having stopped.
+
+        Args:
+            until: Whether it has.
+            push: Sample whose torques are fed forward meanwhile: where a contact is
+                missing, later ones count on it.
+        """
+        if not self.moves or (until is not None and until()):
             return
         i, t = self.i, self.trajectory
         leaves = (x.begin for x in t.segments if x.kind == "swing" and x.begin > i)
         by = min(next(leaves, len(t.time)) - 1, i + round(0.5 * RAMP / PHYSICS_STEP))
-        self.left_plan = self._still = True
+        self.left_plan = True
         if by > i:
-            self._load_at(i, by, down=True)
+            self._load_at(by, down=True, push=push)
+            for _ in self._done():
+                yield
+                if until is not None and until():
+                    return
+        self._rate = np.zeros(0)
+
+    def _stand(self, to: int) -> Actions:
+        """Pause, if the way to sample `to` is long enough to slow down on it."""
+        i = self.i
+        places = []
+        for k in (i, min(i + 10, to)):
+            self._kin.update(self.trajectory.q[k])
+            places.append(self._kin.com.copy())
+        speed = float(np.linalg.norm(places[1] - places[0])) / (10 * PHYSICS_STEP)
+        ramp = float(np.clip(self.rate * speed / BRAKING, RAMP, LONGEST))
+        by = i + round(0.5 * self.rate * ramp / PHYSICS_STEP)
+        if by >= to:
+            return
+        self.left_plan = True
+        seconds, self.pause = self.pause, 0.0
+        if by > i and self.moves:
+            self._load_at(by, down=True, ramp=ramp)
             yield from self._done()
+        yield from self.hold(seconds)
+        self._load_at(to, up=0.0)
 
     def back(self, to: int) -> Actions:
-        """Come to rest, and follow the trajectory back to rest at sample `to`."""
+        """Come to rest, and follow the trajectory back to rest at sample `to`.
+
+        Fed forward are the torques of `to`: contacts made after it may be missing.
+        """
         yield from self.stop()
-        self.left_plan = self._still = True
+        self.left_plan = True
         if self.i > to:
-            self._load_at(self.i, to, up=True, down=True)
+            # To turn round at once would throw the robot over its toes.
+            pace = min(1.0, max((self.i - to) * PHYSICS_STEP / UNHURRIED, 0.25))
+            self._load_at(to, up=0.0, down=True, pace=pace, push=to)
             yield from self._done()
+            self._rate = np.zeros(0)
 
     def aside(self, t: Trajectory, until: Callable[[], bool]) -> Actions:
         """Follow another trajectory until something happens, or there and back."""
-        self.left_plan = self._still = True
+        self.left_plan = True
         self._load(t, slice(None))
         for _ in self._done():
             yield
@@ -132,12 +191,11 @@ class Reference:
 
     def hold(self, seconds: float) -> Actions:
         """Stand still."""
-        self._still = True
         steps, still = round(seconds / PHYSICS_STEP), np.zeros((1, len(self._dadr)))
         now = self.q, self.torque, self.closed
         q, torque, closed = (x[None].copy() for x in now)
-        ahead = self._ahead(np.array([self.i]))
-        self._begin_rows(q, still, torque, closed, ahead, np.zeros(0), steps)
+        ahead, none = self._ahead(np.array([self.i])), np.zeros(0)
+        self._begin_rows(q, still, torque, closed, ahead, none, none, steps)
         yield from self._done()
 
     def resume(self) -> None:
@@ -199,21 +257,34 @@ class Reference:
             q, torque, velocity = q.copy(), torque.copy(), velocity.copy()
             self._blend(at, np.ones(len(at)), q, velocity, torque)
         ahead = self._ahead(at if plays else np.full(len(q), self.i))
-        self._begin_rows(q, velocity, torque, closed, ahead, at, len(q))
+        rate = np.ones(len(at))
+        self._begin_rows(q, velocity, torque, closed, ahead, at, rate, len(q))
 
     def _load_at(
-        self, i: int, to: int, *, up: bool = False, down: bool = False
+        self,
+        to: int,
+        *,
+        up: float | None = None,
+        down: bool = False,
+        ramp: float = RAMP,
+        pace: float = 1.0,
+        push: int | None = None,
     ) -> None:
-        """Follow the trajectory at hand between two samples, slower at its ends.
+        """Follow the trajectory at hand to a sample, slower at the ends of the way.
 
         Args:
-            i: From this sample.
-            to: The last one.
-            up: From rest.
+            to: The sample.
+            up: From this rate.
             down: To rest.
+            ramp: Between rest and the planned speed [s].
+            pace: Share of that at most.
+            push: Sample whose torques are fed forward all the way; None: of each.
         """
+        i = self._place
         way = 1 if to > i else -1
-        done, rate = ramped(abs(to - i), up=up, down=down)
+        done, rate = ramped(abs(to - i) / pace, up=up, down=down, ramp=ramp)
+        done, rate = pace * done, pace * rate
+        done[-1] = abs(to - i)
         at = i + way * done
         t, low = self.trajectory, np.floor(at).astype(int)
         first, share = low.min(), (at - low)[:, None]
@@ -224,13 +295,14 @@ class Reference:
             return x[low] + share * (x[high] - x[low])
 
         q, v, torque = (between(x[rows]) for x in (t.q, t.v, t.tau))
+        if push is not None:
+            torque = np.tile(t.tau[push], (len(torque), 1))
         velocity = way * rate[:, None] * v[:, self._dadr]
         closed = t.contact[rows][low]
         if self._offset is not None and way == 1:
             self._blend(at, rate, q, velocity, torque)
-        self._begin_rows(
-            q, velocity, torque, closed, self._ahead(low + first), at, len(q)
-        )
+        ahead = self._ahead(low + first)
+        self._begin_rows(q, velocity, torque, closed, ahead, at, rate, len(q))
 
     def _begin_rows(
         self,
@@ -240,9 +312,11 @@ class Reference:
         closed: np.ndarray,
         ahead: np.ndarray,
         at: np.ndarray,
+        rate: np.ndarray,
         steps: int,
     ) -> None:
-        self._begin, self._at = self.i, np.floor(at + 1e-9).astype(int)
+        self._begin, self._at = self._place, at
+        self._rate = rate
         if self._rows:
             self._steps.append(self.track.done)
         self.track.load(q, velocity, torque, closed, ahead, steps)
@@ -287,20 +361,24 @@ class Reference:
 
 
 def ramped(
-    distance: int, *, up: bool = False, down: bool = False
+    distance: float, *, up: float | None = None, down: bool = False, ramp: float = RAMP
 ) -> tuple[np.ndarray, np.ndarray]:
     """Samples of the way done (n,) at each step, and the rate (n,) in [0, 1].
 
     Args:
         distance: The way in samples, which take a step each at the planned speed.
-        up: From rest.
+        up: From this rate.
         down: To rest.
+        ramp: Between rest and the planned speed [s].
     """
-    ramps = up + down
-    n = min(round(RAMP / PHYSICS_STEP), 2 * distance // max(ramps, 1)) // 2 * 2
+    ramps = (up is not None) + down
+    n = min(round(ramp / PHYSICS_STEP), int(2 * distance) // max(ramps, 1)) // 2 * 2
     rise = 0.5 - 0.5 * np.cos(np.pi * (np.arange(n) + 0.5) / max(n, 1))
-    rate = np.ones(distance - ramps * n // 2)
-    rate = np.concatenate([rise[: n * up], rate, rise[::-1][: n * down]])
+    first = rise[:0] if up is None else rise[rise > up]
+    last = rise[::-1] if down else rise[:0]
+    plain = distance - float(np.sum(first) + np.sum(last))
+    rate = np.concatenate([first, np.ones(max(math.ceil(plain), 0)), last])
+    rate *= min(distance / np.sum(rate), 1.0 / rate.max())
     done = np.cumsum(rate)
     done[-1] = distance
     return done, rate

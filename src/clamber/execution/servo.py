@@ -24,10 +24,12 @@ import numpy as np
 
 from clamber import _core
 from clamber.model.world import PHYSICS_STEP, World, chain_up, recompiled
+from clamber.planning.timing import Speed
 
 ControlMode = Literal["pid", "mixed"]
 INTEGRAL_LIMIT = 5.0  # [N m] the integral term saturates here
 EASING = 0.5  # [s] from held to self-positioned
+SLOW = 0.5  # [rad/s] the fastest motion in which ankles do not have to balance
 
 
 def driven_world(world: World, mode: ControlMode) -> World:
@@ -63,14 +65,19 @@ def joint_servo(world: World) -> _core.JointServo:
     )
 
 
-def self_positioning(world: World) -> _core.SelfPositioning:
+def self_positioning(world: World, speed: Speed) -> _core.SelfPositioning:
     """The share to which ankles of planted feet position themselves (4.32).
 
     From when both arms are loaded until a foot must step again; eased in and out. Of
-    the joints that the robot's description says so of.
+    the joints that the robot's description says so of, in motion that is slow.
+
+    Args:
+        world: With the robot.
+        speed: Of its fastest joint [rad/s].
     """
     surfaces, limbs = list(world.surfaces), world.robot.limbs.values()
-    ankles = self_positioning_joints(world)
+    slow = speed != "max" and speed <= SLOW
+    ankles = self_positioning_joints(world) if slow else {}
     return _core.SelfPositioning(
         arms=[[surfaces.index(s) for s in x.surfaces] for x in limbs if x.is_arm],
         ankles=[

@@ -104,6 +104,7 @@ def simulate(
     controller: ControlMode = DEFAULT_CONTROLLER,
     disturbance: Disturbance | None = None,
     true_scene: SceneLike | None = None,
+    pause: float | None = None,
     progress: Progress | None = None,
 ) -> Rollout:
     """Run the trajectory of a plan in MuJoCo.
@@ -115,6 +116,8 @@ def simulate(
         disturbance: How the perturbed world differs from the planned one, and how well
             it is sensed.
         true_scene: Where it is not the planned one.
+        pause: When the robot is told to slow down and to stand for 10 s where it is
+            [s]; None: never. `mixed` only.
         progress: Called with stage, share and note.
 
     Raises:
@@ -130,6 +133,12 @@ def simulate(
             field="disturb.x, y, yaw",
             value=(d.x, d.y, d.yaw),
         )
+    if pause is not None and not pause >= 0.0:
+        raise InputError("0 s or more", field="pause", value=pause)
+    if pause is not None and controller == "pid":
+        raise InputError(
+            "none: pid goes on, whatever it is told", field="pause", value=pause
+        )
     truth = None if true_scene is None else load_scene(true_scene)
     world = driven_world(perturbed_world(plan.world, d, truth), controller)
     share, report = 0.0, progress or silent
@@ -137,7 +146,10 @@ def simulate(
         follower = OpenLoop(plan, world)
     else:
         follower = Executive(
-            plan, world, lambda _, done, note: report("simulate", share, note)
+            plan,
+            world,
+            lambda _, done, note: report("simulate", share, note),
+            pause=pause,
         )
     rng = np.random.default_rng([d.seed, 1])
     sensors = Sensors(world, noise=d.noise, delay=d.delay, rng=rng)

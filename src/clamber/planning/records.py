@@ -37,7 +37,7 @@ class PlanOptions:
     """
 
     method: Method = "direct"
-    speed: Speed = 0.3
+    speed: Speed = 1.0
     max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 

@@ -73,7 +73,13 @@ def settle(
         posture_weight=1.0,
         margin=0.005,
     )
-    problem = replace(problem, ellipse_weight=0.0, com_weight=0.0)
+    # Where it is, whatever is near: to keep a clearance it would have to move first.
+    problem = replace(
+        problem,
+        clearance=np.minimum(problem.clearance, 0.0),
+        ellipse_weight=0.0,
+        com_weight=0.0,
+    )
     here = ik.solve_hard(problem, now.q)
     task = KeyframeTask(held=now.stance, new=(), q_reference=here.q)
     key = direct(ik, task, here.q, options.keyframe)
