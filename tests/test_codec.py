@@ -25,7 +25,7 @@ from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict, judge
 from clamber.model.patches import mesh_of
 from clamber.model.robot import Limb, Robot
-from clamber.model.scene import Support
+from clamber.model.scene import HeightField, Support
 from clamber.model.world import Surface, World
 from clamber.planning.records import Fallback, Iteration, Plan, State, Tried
 from clamber.planning.trajectory import Samples, Trajectory
@@ -179,6 +179,10 @@ def rarer(plan: Plan) -> Iterator[Any]:
     yield Iteration(option="ac1", cost=1 / 3)
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) / 3
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    heights = np.arange(6).reshape(2, 3) / 3
+    yield HeightField(
+        heights=heights, size=np.ones(2) / 3, position=np.ones(2), yaw=1 / 3
+    )
     yield mesh_of("rock", corners, faces, friction=1 / 3, notes=("turned round",))
 
 

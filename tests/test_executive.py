@@ -321,7 +321,7 @@ def test_it_pauses_anywhere_and_goes_on(hands_plan, share):
     assert first(rollout, Paused).time == pytest.approx(told, abs=0.011)
     assert not rollout.fell
     assert rollout.stopped == ""
-    assert len(rollout.ctrl) - len(t.time) == pytest.approx(10_300, abs=700)
+    assert len(rollout.ctrl) - len(t.time) == pytest.approx(10_600, abs=700)
     stride, joints = rollout.stride, rollout.world.qadr
     begin = round((told + 2.5) / PHYSICS_STEP / stride)
     still = rollout.qpos[begin : begin + round(7.0 / PHYSICS_STEP / stride)]
@@ -401,7 +401,7 @@ class Told:
     def scales(self, share: float = 1.0, **newtons: float) -> np.ndarray:
         """(nS, 3) forces, a share of the weight; some as they are said."""
         t = self.trajectory
-        rows = [min(self.k + n, len(t.time) - 1) for n in (0, 60)]
+        rows = [min(self.k + n, len(t.time) - 1) for n in (0, 40)]
         closed = t.contact[rows].any(axis=0)
         force = np.zeros((len(self.surfaces), 3))
         force[closed, 2] = share * 9.81 * self.world.mass / closed.sum()

@@ -7,7 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clamber.execution.reference import BLEND, RAMP, STEPS, Reference, ramped
+from clamber.execution.reference import (
+    BLEND,
+    RAMP,
+    STEPS,
+    UNHURRIED,
+    Reference,
+    ramped,
+)
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import PHYSICS_STEP
 
@@ -52,7 +59,10 @@ def test_going_back_is_the_way_in_reverse_from_rest_to_rest(ref, hands_plan):
     exhaust(ref, ref.play(900))
     ramp = round(RAMP / PHYSICS_STEP)
     rows = [(ref.q.copy(), ref.velocity.copy()) for _ in steps(ref, ref.back(700))]
-    assert len(rows) == ramp + (200 + ramp // 2) + ramp
+    # The 200 samples and those of slowing down, in less of a hurry than they came.
+    away = 200 + ramp // 2
+    slower = max(away, round(UNHURRIED / PHYSICS_STEP))
+    assert len(rows) == ramp + slower + ramp
     assert np.abs(rows[ramp - 1][1]).max() < 1e-3
     assert np.abs(kin.difference(rows[ramp - 1][0], t.q[900 + ramp // 2])).max() < 1e-9
     assert ref.i == 700

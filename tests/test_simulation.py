@@ -58,8 +58,8 @@ def test_a_run_lets_go_of_its_buffers_when_it_is_over(one_hand_plan, monkeypatch
     """Without waiting for the garbage collector: a sweep makes thousands."""
     made, plain = [], Executive.__init__
 
-    def noted(self, *args):
-        plain(self, *args)
+    def noted(self, *args, **more):
+        plain(self, *args, **more)
         made.append(weakref.ref(self))
 
     monkeypatch.setattr(Executive, "__init__", noted)

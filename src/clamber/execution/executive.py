@@ -307,7 +307,7 @@ class Executive:
 
         self.estimate.expect(c, force=PRESSED)
         yield from ref.play(late, until=is_there)
-        yield from ref.stop(until=is_there, push=span.touch)
+        yield from ref.stop(until=is_there)
         self.estimate.expect()
         if is_there():
             return False

@@ -162,14 +162,15 @@ def believed_scene(scene: Scene, measured: Iterable[tuple[str, np.ndarray]]) -> 
     points: dict[str, list[np.ndarray]] = {}
     for support, p in measured:
         points.setdefault(support, []).append(p)
-    felt = {name: np.array(p) for name, p in points.items()}
+    touched = {name: np.array(p) for name, p in points.items()}
     return replace(
         scene,
         boxes=tuple(
-            fitted_box(b, felt[b.name]) if b.name in felt else b for b in scene.boxes
+            fitted_box(b, touched[b.name]) if b.name in touched else b
+            for b in scene.boxes
         ),
         meshes=tuple(
-            fitted_mesh(m, felt) if any(s.name in felt for s in m.supports) else m
+            fitted_mesh(m, touched) if any(s.name in touched for s in m.supports) else m
             for m in scene.meshes
         ),
     )

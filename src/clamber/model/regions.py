@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -456,7 +457,8 @@ def _area_in(ends: np.ndarray, triangles: np.ndarray, ragged: float) -> BaseGeom
             shape = shapely.build_area(lines)
     if not shape.is_valid or abs(shape.area - area) > 0.05 * area:
         cells = shapely.get_parts(shapely.polygonize([shapely.node(lines)]))
-        tree = shapely.STRtree(np.atleast_1d(shapely.polygons(triangles)))
+        faces: Any = shapely.polygons(triangles)  # an array, for an array of rings
+        tree = shapely.STRtree(faces)
         full = tree.query(shapely.point_on_surface(cells), predicate="intersects")[0]
         shape = shapely.coverage_union_all(cells[np.unique(full)])
     if ragged > 0.0:
