@@ -144,7 +144,8 @@ $(VENV)/.has-core: pyproject.toml constraints.txt $(NATIVE) | $(VENV)/.can-build
 	@echo "compiling the native core, and fetching NumPy, SciPy, MuJoCo ... meanwhile: about a minute ..."
 	@touch $@.begun
 	@$(call fetch,video) & \
-		$(BIN)/python $(PIP) --no-build-isolation --no-deps -e .; wait $$!
+		$(BIN)/python $(PIP) --no-build-isolation --no-deps -e .; built=$$?; \
+		wait $$! && exit $$built
 	@mv $@.begun $@
 
 # What compiles it: CMake and Ninja are the system's where it has them.

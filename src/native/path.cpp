@@ -327,8 +327,8 @@ void PathPlanner::holding_torques(const std::vector<Contact>& contacts,
 // Overlaps and contacts at all postures of a phase and half-way between, solver aside.
 // Whether the contacts hold the robot at the postures of a swing, too: those at its ends
 // have been looked at, and while weight shifts more contacts bear.
-bool PathPlanner::check_phase(const Transition& t, int k, Path& out) {
-    const std::vector<Contact> contacts = closed_contacts(t)[k];
+bool PathPlanner::check_phase(const Transition& t, const std::vector<Contact>& contacts,
+                              int k, Path& out) {
     std::vector<Contact> moving = t.rolling;
     if (t.makes) moving.push_back(t.made);
     watch(contacts, moving, low_);
@@ -365,8 +365,9 @@ bool PathPlanner::check_phase(const Transition& t, int k, Path& out) {
 
 void PathPlanner::check(const Transition& t, Path& out) {
     out.forget();
+    const auto contacts = closed_contacts(t);
     for (int k = 0; k < 3; ++k)
-        if (!check_phase(t, k, out) && out.status == Path::Status::Opens) return;
+        if (!check_phase(t, contacts[k], k, out) && out.status == Path::Status::Opens) return;
 }
 
 Vec3 lean_direction(const Vec3& p1, const Vec3& p2, const Mat3& R_WB) {
@@ -443,13 +444,13 @@ void PathPlanner::plan(const Transition& t, Path& out) {
     out.forget();
     out.phases = {Postures{t.before, t.shifted}, {}, {t.touching, t.after}};
     // The swing first, which is hardest: where it fails, nothing else is asked.
-    swing(t, out);
-    if (!check_phase(t, 1, out)) return;
     const auto contacts = closed_contacts(t);
+    swing(t, out);
+    if (!check_phase(t, contacts[1], 1, out)) return;
     bridge(t.before, t.shifted, contacts[0], out.phases[0]);
-    if (!check_phase(t, 0, out)) return;
+    if (!check_phase(t, contacts[0], 0, out)) return;
     bridge(t.touching, t.after, contacts[2], out.phases[2]);
-    check_phase(t, 2, out);
+    check_phase(t, contacts[2], 2, out);
 }
 
 }  // namespace clamber

@@ -101,7 +101,8 @@ class PathPlanner {
     void fill(const std::vector<double>& a, const std::vector<double>& b, int points,
               const std::vector<Contact>& contacts, const std::vector<Contact>& moving,
               bool refine, Fill node, Postures& out);
-    bool check_phase(const Transition& t, int k, Path& out);
+    bool check_phase(const Transition& t, const std::vector<Contact>& contacts, int k,
+                     Path& out);
     void watch(const std::vector<Contact>& contacts, const std::vector<Contact>& more,
                std::vector<unsigned char>& out) const;
     double overlap(const double* q, const std::vector<unsigned char>& watched, int* pair);

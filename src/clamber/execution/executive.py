@@ -97,7 +97,7 @@ class OpenLoop:
         self._ref = Reference(t, world)
         self._ref.follow(t, -1)
         filter_ = Estimate(plan.world, t.q[0]).filter
-        held = self_positioning(world, "max")
+        held = self_positioning(world, "max")  # no ankle follows what is measured
         self.core = _follower(world, filter_, self._ref, held)
         self.events: list[Event] = []
         self.followed: Trajectory | None = None

@@ -135,11 +135,8 @@ class Reference:
     def _stand(self, to: int) -> Actions:
         """Pause, if the way to sample `to` is long enough to slow down on it."""
         i = self.i
-        places = []
-        for k in (i, min(i + 10, to)):
-            self._kin.update(self.trajectory.q[k])
-            places.append(self._kin.com.copy())
-        speed = float(np.linalg.norm(places[1] - places[0])) / (10 * PHYSICS_STEP)
+        self._kin.update(self.trajectory.q[i])
+        speed = np.linalg.norm(self._kin.com_jacobian() @ self.trajectory.v[i])
         ramp = float(np.clip(self.rate * speed / BRAKING, RAMP, LONGEST))
         by = i + round(0.5 * self.rate * ramp / PHYSICS_STEP)
         if by >= to:

@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from clamber.model.scene import Box, Mesh, Scene, Support
+from clamber.model.scene import EVEN, Box, Mesh, Scene, Support
 from clamber.model.se3 import matrix_from_quat
 
 HEIGHT_SIGMA = 0.05  # [m] what is expected of a box's height
@@ -31,7 +31,6 @@ CONTACT_SIGMA = 0.006  # [m] how well a contact's height is measured on a smooth
 CAUTION = 0.02  # [m] least distance more from a top that was measured
 PART_SIGMA = 0.015  # [m] of a support's height, besides its mesh's
 PART_SLOPE = 0.05  # [rad] ... and of its slopes: what is scanned is known well
-EVEN = 0.012  # [m] corners of a piece so near a support are moved with it
 ROUGHNESS = (0.0, 0.010, 0.020, 0.035)  # [m] that a top may have
 
 

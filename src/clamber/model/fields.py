@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from clamber.model.regions import face_normals
 from clamber.model.scene import HeightField
 
 FINEST = 0.006  # [m] spacing of a field
@@ -25,10 +26,8 @@ def is_seen_from_above(vertices: np.ndarray, faces: np.ndarray) -> bool:
         vertices: (V, 3) in the world [m].
         faces: (F, 3) counter-clockwise seen from outside.
     """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    area = np.linalg.norm(normal, axis=1)
-    return bool(area[normal[:, 2] < -DOWN * area].sum() <= HIDDEN * area.sum())
+    normals, areas = face_normals(vertices, faces)
+    return bool(areas[normals[:, 2] < -DOWN].sum() <= HIDDEN * areas.sum())
 
 
 def field_of(vertices: np.ndarray, faces: np.ndarray) -> HeightField:

@@ -25,13 +25,12 @@ from clamber.model.regions import (
     polygons_in,
     tidied,
 )
-from clamber.model.scene import HeightField, Mesh, Rejected, Support
+from clamber.model.scene import EVEN, HeightField, Mesh, Rejected, Support
 
 FILL = 0.008  # [m] of a notch in a border that a convex part may fill
 NARROW = 0.022  # [m] radius of the smallest disc that has room on a support
 STEEPEST = 0.02  # of a normal's z below which a face is a wall
 COVERED = 0.12  # [m] what is nearer over a support leaves no room for a limb
-EVEN = 0.012  # [m] what rises less from a support belongs to it
 DEEPEST = 0.4  # [m] of a piece under its region
 SHEET = 0.006  # [m] ... and the least
 LISTED = 0.01  # [m^2] a smaller region that is no support is not worth a word

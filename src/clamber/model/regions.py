@@ -176,8 +176,15 @@ def _around(
     return out
 
 
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) unit normals and (F,) areas."""
+def face_normals(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) unit normals and (F,) areas [m^2].
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3) counter-clockwise seen from outside.
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     n = np.cross(b - a, c - a)
     length = np.linalg.norm(n, axis=1)
@@ -194,7 +201,7 @@ def _evenness(
     """
     if len(pairs) == 0:
         return SMOOTH, TURN
-    normals, _ = _normals(vertices, faces)
+    normals, _ = face_normals(vertices, faces)
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).max(axis=1)
     fine = (longest[pairs] < FINE).all(axis=1)
@@ -276,7 +283,7 @@ def _denoised(
     vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, alike: float
 ) -> np.ndarray:
     """Vertices moved so that triangles have the normals that are smoothed."""
-    normals, areas = _normals(vertices, faces)
+    normals, areas = face_normals(vertices, faces)
     soft = _smoothed(normals, areas, pairs, ROUNDS, alike)
     count = np.maximum(np.bincount(faces.ravel(), minlength=len(vertices)), 1)
     for _ in range(ROUNDS):
@@ -301,7 +308,7 @@ def _regions(
     alike: float,
 ) -> list[Region]:
     """Planar regions, in the order in which they were found: the flattest first."""
-    normals, areas = _normals(vertices, faces)
+    normals, areas = face_normals(vertices, faces)
     n = len(faces)
     soft = _smoothed(normals, areas, pairs, 4 if turn > TURN else 0, alike)
     ends = np.concatenate([pairs, pairs[:, ::-1]])

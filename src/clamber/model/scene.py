@@ -19,6 +19,7 @@ from clamber.model.se3 import matrix_from_rpy
 GROUND = "ground"
 GROUND_HALF_SIZE = 20.0  # [m] the ground is a support of this half width
 NEAR_FACE = 0.23  # [m] from the ankles' midpoint to the box of `Scene.from_height`
+EVEN = 0.012  # [m] what rises less from a support of a mesh belongs to it
 MAX_LENGTH = 50.0  # [m] a larger box is a wrong unit
 _ROUNDING = 1e-9  # [m]
 

@@ -399,7 +399,8 @@ def _lowest(model: mujoco.MjModel) -> float:
     R = data.geom_xmat.reshape(-1, 3, 3)[solid]
     centre, half = np.split(model.geom_aabb[solid], 2, axis=1)
     z = data.geom_xpos[solid, 2] + np.einsum("ij,ij->i", R[:, 2], centre)
-    return min(0.0, *(z - np.einsum("ij,ij->i", np.abs(R[:, 2]), half)), 0.0)
+    low = z - np.einsum("ij,ij->i", np.abs(R[:, 2]), half)
+    return float(np.min(low, initial=0.0))
 
 
 def bar(kind: mujoco.mjtGeom, ends: np.ndarray, width: float, colour: Colour) -> Shape:
