@@ -19,15 +19,17 @@ from clamber.execution.verdict import judge
 from clamber.model.kinematics import Kinematics
 from clamber.model.scene import Scene
 from clamber.model.world import build_world
-from clamber.planning import planner
+from clamber.planning import planner, start
 from clamber.planning.planner import plan
 from clamber.planning.records import Budget, Fallback, State
 from clamber.planning.search import Search
-from clamber.planning.start import from_here, state_of, steps_done
+from clamber.planning.start import from_here, settle, state_of, steps_done
 from clamber.planning.trajectory import HOLD_START, RATE, holding_torque
 from clamber.run.folder import load_plan, save_plan
 from clamber.run.state import load_state
 from clamber.step.change import Failure
+from clamber.step.ik import IK
+from clamber.step.path import bridge, can_be_gone
 from clamber.step.stability import contact_drift
 
 OFFSETS = [(0.0, 0.0, 0.02), (0.0, 0.0, -0.03), (0.012, -0.01, 0.015)]
@@ -290,6 +292,31 @@ def test_with_no_steps_left_there_is_still_the_way_to_a_good_posture(fast_plan):
     assert described(found.start.stance) == described(contacts)
     end = Kinematics(found.world).difference(found.trajectory.q[-1], found.start.q)
     assert np.abs(end).max() < 1e-6
+
+
+@pytest.mark.parametrize("open_way", [True, False])
+def test_where_the_way_to_a_better_posture_lets_go_of_a_contact_it_is_not_gone(
+    demo_plan, monkeypatch, open_way
+):
+    """A posture with the same contacts may lie on the other side of one that slips."""
+    monkeypatch.setattr(start, "can_be_gone", lambda *_: open_way)
+    ik, stance = IK(demo_plan.world), demo_plan.keyframes[5].stance
+    now = State(done=5, stance=stance, loaded=stance, q=demo_plan.changes[4].touching)
+    key, (here, way) = settle(ik, now, demo_plan.options)
+    assert key.status is Status.SOLVED
+    assert described(key.stance) == described(stance)
+    moved = np.abs(ik.kin.difference(here.q[-1], key.q)).max()
+    assert (moved > 0.03) == open_way
+    np.testing.assert_array_equal(way.q[[0, -1]], [here.q[-1], key.q])
+
+
+def test_a_way_on_which_a_contact_opens_cannot_be_gone(demo_plan):
+    ik = IK(demo_plan.world)
+    key, other = demo_plan.keyframes[3], demo_plan.keyframes[0]
+    assert can_be_gone(ik, np.stack([key.q, key.q]), key.stance)
+    way = bridge(ik, key.q, key.q, key.stance)
+    assert can_be_gone(ik, way, key.stance)
+    assert not can_be_gone(ik, np.stack([key.q, other.q]), key.stance)
 
 
 def test_a_stance_that_cannot_be_is_said_to_be_none(fast_plan):

@@ -25,8 +25,8 @@ from clamber.planning.records import Plan, PlanOptions, State
 from clamber.step.change import standing
 from clamber.step.ik import IK
 from clamber.step.methods import direct
-from clamber.step.path import Phase, bridge
-from clamber.step.posture import Keyframe, KeyframeTask
+from clamber.step.path import Phase, bridge, can_be_gone
+from clamber.step.posture import Keyframe, KeyframeTask, finish
 from clamber.step.tasks import support_rotation
 from clamber.step.transition import balance_problem
 
@@ -85,6 +85,20 @@ def settle(
     key = direct(ik, task, here.q, options.keyframe)
     if key.status is not Status.SOLVED:
         return key, ()
+    way = bridge(ik, here.q, key.q, now.stance)
+    if here.status is Status.SOLVED and not can_be_gone(ik, way, now.stance):
+        # The better posture lies elsewhere: what follows begins where the robot is.
+        key = finish(
+            ik,
+            task,
+            options.keyframe,
+            here.q,
+            method=key.method,
+            iterations=here.iterations,
+            cost_before=key.cost_before,
+        )
+        key = replace(key, status=Status.SOLVED)
+        way = np.stack([here.q, here.q])
     begin = here.q.copy()
     begin[world.qadr] = now.q[world.qadr]
     lead = (
@@ -97,7 +111,7 @@ def settle(
         ),
         Phase(
             kind="settle",
-            q=bridge(ik, here.q, key.q, now.stance),
+            q=way,
             contacts=now.stance,
             load_before=now.loaded,
             load_after=now.stance,

@@ -191,6 +191,19 @@ def bridge(
     return ik.core.bridge(a, b, *packed_contacts(ik.world, contacts))
 
 
+def can_be_gone(ik: IK, q: np.ndarray, contacts: Sequence[Contact]) -> bool:
+    """Whether contacts stay closed and hold the robot along a way, without overlaps.
+
+    Args:
+        ik: Workspace.
+        q: (n, nq) postures; half-way between is looked at, too.
+        contacts: All that bear load.
+    """
+    parts = packed_parts(ik.world, contacts, (), None)
+    status, *_ = ik.core.check_path([q[:1], q, q[-1:]], parts)
+    return not status
+
+
 def straightened(ik: IK, settle: Phase, shift: Phase) -> tuple[Phase, Phase] | None:
     """Two phases of one stance, from the first posture to the last without a detour.
 
@@ -211,9 +224,7 @@ def straightened(ik: IK, settle: Phase, shift: Phase) -> tuple[Phase, Phase] | N
     }:
         return None
     q = bridge(ik, settle.q[0], shift.q[-1], contacts)
-    parts = packed_parts(ik.world, contacts, (), None)
-    status, *_ = ik.core.check_path([q[:1], q, q[-1:]], parts)
-    if status:  # what is wrong with it
+    if not can_be_gone(ik, q, contacts):
         return None
     if len(q) == 2:
         q = np.stack([q[0], interpolate(ik.kin, q[0], q[1], 0.5), q[1]])
