@@ -1,7 +1,7 @@
 """A policy and a stance -> which contacts to try next, in order: geometry alone.
 
 Algorithm 3 of the thesis: the policy's cycles are run from the initial state until the
-goal; contacts start at the obstacle's closest points and go on by a third of what the
+goal; contacts start at the obstacle's closest points and go on by shares of what the
 limb reaches, towards the goal. What comes next is read off the stance alone, so that a
 plan can go on from any stance, as it is measured: steps on the feet, the climb of an
 edge or a flight of stairs, a cycle on all fours, the way down.
@@ -66,7 +66,9 @@ from clamber.planning.stairs import CLEAR, FLUSH, Flight
 from clamber.step.change import home_at
 from clamber.step.posture import Keyframe
 
-TURN = 0.25  # [rad] of the body in one cycle on all fours, at most
+# Of the body in one cycle on all fours, at most: [rad], and in steps of the limb that
+# steps least. Longer ones, and the cycle fails: then it is tried shorter.
+TURN, STRIDE = 0.4, 1.6
 STEP_TURN = 0.30  # [rad] of the body in one step of each foot, at most
 SHARES = (1.0, 0.6, 0.3)  # of its length: a step that fails is tried shorter
 RISER_SHARES = (1.0, 0.5, 0.25)  # ... a cycle over a riser
@@ -409,9 +411,10 @@ class Gait:
             wanted = Frame(wanted.xy, platform.entry.yaw)
         heading = self.heading(platform, frame, wanted)
         yield from self._over_gap(at, platform, frame, heading)
-        full = frame.towards(heading, min(self.proportions.step.values()), TURN)
+        step, risers = min(self.proportions.step.values()), self.has_risers(platform)
+        full = frame.towards(heading, step if risers else STRIDE * step, TURN)
         leading = self.leading_first(frame, full)
-        if self.has_risers(platform):
+        if risers:
             # The second knee over a riser wants the elbows near, so that knees may have
             # to go first; and where the next riser leaves elbows no room, hands bear
             # the trunk higher.
