@@ -37,7 +37,7 @@ class PlanOptions:
     """
 
     method: Method = "direct"
-    speed: Speed = 1.0
+    speed: Speed = 2.0
     max_changes: int = 1000
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
 
