@@ -35,7 +35,7 @@ SLOW, SLOWLY = 0.3, 2.0
 SMOOTHING = 0.06  # [s] width of the kernel that rounds the acceleration's corners
 STEP = 1.0 / RATE  # [s]
 # Made use of by inertia, of what is left between rest and the border of what can be
-# borne. With 0.8 one climb in ten fell at `max` where a box was 2 cm higher than planned.
+# borne. With 0.8 one climb in ten fell at `max`, on boxes 2 cm higher than planned.
 SHARE = 0.6
 _FLAT = 1e-3  # a path is no flatter than this: where nothing moves, nothing is limited
 
