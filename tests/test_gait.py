@@ -17,7 +17,14 @@ from clamber.errors import InputError, Status
 from clamber.model.robot import load_robot
 from clamber.model.scene import GROUND, Box, Scene
 from clamber.model.world import build_world
-from clamber.planning.gait import BEFORE_RISER, RISER_SHARES, SHARES, Gait
+from clamber.planning.gait import (
+    BEFORE_RISER,
+    RISER_SHARES,
+    SHARES,
+    STRIDE,
+    TURN,
+    Gait,
+)
 from clamber.planning.gaps import due_near_gap, gaps_ahead
 from clamber.planning.proposals import FREELY, Climb, Outcome, Proposal, pursue
 from clamber.planning.route import Frame
@@ -339,7 +346,10 @@ def test_a_cycle_that_fails_is_proposed_otherwise_in_order(wide):
     frame = wide.quadrupedal_frame(stance)
     tries = cycles(proposed(wide, stance))
     full, legs, half, straight, turned = tries
-    assert frame.away(full.body) <= min(wide.proportions.step.values()) + 1e-9
+    # What is left of the way to the edge is less than a whole cycle.
+    step = min(wide.proportions.step.values())
+    assert step < frame.away(full.body) <= STRIDE * step + 1e-9
+    assert full.body.yaw - frame.yaw == pytest.approx(TURN)
     assert wanted(full) == (*ELBOWS, *KNEES)
     assert wanted(legs) == (*KNEES, *ELBOWS)
     assert legs.body is full.body
@@ -444,6 +454,7 @@ def test_over_a_riser_shorter_cycles_and_hands_are_proposed_first(risers):
     tries = cycles(proposed(risers, stance))[:12]
     ways = [risers.quadrupedal_frame(stance).away(p.body) for p in tries]
     np.testing.assert_allclose(ways, np.repeat(2 * RISER_SHARES, 2) * ways[0])
+    assert ways[0] <= min(risers.proportions.step.values()) + 1e-9  # no longer stride
     arms = [{s[1:] for s in wanted(p) if s[1:] != "Knee"} for p in tries]
     assert arms == [{"Elbow"}] * 6 + [{"Hand"}] * 6
     assert [wanted(p)[0][1:] == "Knee" for p in tries] == [False, True] * 6

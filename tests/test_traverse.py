@@ -249,6 +249,7 @@ def test_a_box_is_crossed_and_the_robot_stands_beyond_it(crossing):
     assert len(crossing.iterations) == len(crossing.changes)
     costs = [i.cost for i in crossing.iterations]
     assert costs[-1] < 0.1 < costs[0]
+    assert len(crossing.changes) < 50  # it turns round on top in few cycles
 
 
 @pytest.mark.slow
