@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from clamber.contact.contact import (
     PARTS,
@@ -251,7 +250,11 @@ def local_quadratics(x: np.ndarray, n: int, order: int) -> np.ndarray:
     fit = np.linalg.pinv(powers)  # coefficients of the quadratic, from the samples
     slopes = np.column_stack([np.zeros(n), np.ones(n), 2.0 * powers[:, 1]])
     at = (powers, slopes / half)[order] @ fit  # (n, n) values from the samples
-    out = correlate1d(x, at[half], axis=0, mode="constant")
+    weights, mirror = at[half], (1.0, -1.0)[order]
+    out = weights[half] * x
+    inner, last = out[half : len(x) - half], len(x) - n + 1
+    for k in range(half):  # samples as far before as after have the same weight
+        inner += (x[k : k + last] + mirror * x[n - 1 - k :][:last]) * weights[k]
     for ends, rows in (
         (slice(None, n), slice(half)),
         (slice(-n, None), slice(-half, None)),
