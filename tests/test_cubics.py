@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import correlate1d
 
 from clamber.model import cubics
-from clamber.recording.detect import local_quadratics
+from clamber.recording.detect import correlated, local_quadratics
 
 
 def some(n, seed=0):
@@ -41,17 +41,18 @@ def test_a_curve_that_never_overshoots_is_that_of_pchip(n):
         assert np.array_equal(cubics.along(c, x, at)[0], known(at))
 
 
-@pytest.mark.parametrize("n", [5, 9, 25])
 @pytest.mark.parametrize("order", [0, 1])
-def test_tracks_are_smoothed_as_by_a_correlation(n, order):
-    x = np.random.default_rng(n).normal(size=(80, 4, 3))
-    impulse = np.zeros((2 * n - 1, 1))
-    impulse[n - 1] = 1.0
-    half = n // 2
-    weights = local_quadratics(impulse, n, order)[half : half + n, 0][::-1]
-    known = correlate1d(x, weights, axis=0, mode="constant")
-    found = local_quadratics(x, n, order)
-    assert np.array_equal(found[half:-half], known[half:-half])
+def test_tracks_are_smoothed_as_by_a_correlation(order):
+    for n in range(5, 40, 2):  # rounding leaves some of the weights no mirror of others
+        x = np.random.default_rng(n).normal(size=(80, 4, 3))
+        impulse = np.zeros((2 * n - 1, 1))
+        impulse[n - 1] = 1.0
+        half = n // 2
+        weights = local_quadratics(impulse, n, order)[half : half + n, 0][::-1]
+        known = correlate1d(x, weights, axis=0, mode="constant")
+        found = local_quadratics(x, n, order)
+        assert np.array_equal(found[half:-half], known[half:-half])
+        assert np.array_equal(correlated(x, weights), known[half:-half])
 
 
 @pytest.mark.whole

@@ -250,16 +250,33 @@ def local_quadratics(x: np.ndarray, n: int, order: int) -> np.ndarray:
     fit = np.linalg.pinv(powers)  # coefficients of the quadratic, from the samples
     slopes = np.column_stack([np.zeros(n), np.ones(n), 2.0 * powers[:, 1]])
     at = (powers, slopes / half)[order] @ fit  # (n, n) values from the samples
-    weights, mirror = at[half], (1.0, -1.0)[order]
-    out = weights[half] * x
-    inner, last = out[half : len(x) - half], len(x) - n + 1
-    for k in range(half):  # samples as far before as after have the same weight
-        inner += (x[k : k + last] + mirror * x[n - 1 - k :][:last]) * weights[k]
+    out = np.empty_like(x)
+    out[half : len(x) - half] = correlated(x, at[half])
     for ends, rows in (
         (slice(None, n), slice(half)),
         (slice(-n, None), slice(-half, None)),
     ):
         out[ends][rows] = np.tensordot(at[rows], x[ends], axes=1)
+    return out
+
+
+def correlated(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(T - n + 1, ...) sums of n weights, an odd number, times the samples of tracks.
+
+    To the last bit those of SciPy, which is slow to import.
+    """
+    n = len(weights)
+    half, last = n // 2, len(x) - n + 1
+    for mirror in (1.0, -1.0):
+        if np.abs(weights - mirror * weights[::-1]).max() <= np.finfo(float).eps:
+            out = weights[half] * x[half:][:last]
+            for k in range(half):
+                both = x[k:][:last] + mirror * x[n - 1 - k :][:last]
+                out += both * weights[k]
+            return out
+    out = weights[-1] * x[n - 1 :]
+    for k in range(n - 1):
+        out += weights[k] * x[k:][:last]
     return out
 
 
