@@ -28,7 +28,7 @@ from clamber.planning.trajectory import HOLD_START, RATE, holding_torque
 from clamber.run.folder import load_plan, save_plan
 from clamber.run.state import load_state
 from clamber.step.change import Failure
-from clamber.step.stability import contact_drift
+from oracles import contact_drift
 
 OFFSETS = [(0.0, 0.0, 0.02), (0.0, 0.0, -0.03), (0.012, -0.01, 0.015)]
 

@@ -50,7 +50,7 @@ from clamber.run.codec import (
 from clamber.run.forms import CODEC
 from clamber.step.change import Change
 from clamber.step.posture import Keyframe
-from clamber.step.stability import contact_points
+from clamber.step.stability import statics_at
 
 SEQUENCE = "sequence.json"
 POLICY = "policy.json"
@@ -251,8 +251,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
 
 def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
     """A keyframe by the keys of `plan.json`, and where its forces act."""
-    kin.update(k.q)
-    points = contact_points(kin, k.stance)
+    points, *_ = statics_at(kin, k.q, k.stance)
     acting = {"surfaces": points.names, "points": points.points}
     out = CODEC.encode(k)
     out["static_equilibrium"] |= CODEC.encode(acting)
