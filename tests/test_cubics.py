@@ -30,6 +30,17 @@ def test_a_smooth_curve_and_its_derivatives_are_those_of_a_clamped_spline(n):
         assert np.array_equal(found, known(at, order))
 
 
+def test_nodes_increase_and_points_are_finite():
+    x, y = some(4)
+    ends, nothing = np.zeros((2, 7)), np.where(np.arange(4) == 2, np.nan, 1.0)
+    for nodes, points in (
+        *((x[::-1], y), (x * [1, 1, 0, 1], y), (x[:1], y[:1]), (x, y[:3])),
+        *((x * nothing, y), (x, y * nothing[:, None])),
+    ):
+        with pytest.raises(ValueError, match="nodes that increase"):
+            cubics.smooth_slopes(nodes, points, ends)
+
+
 @pytest.mark.parametrize("n", [2, 3, 4, 30])
 def test_a_curve_that_never_overshoots_is_that_of_pchip(n):
     for seed in range(20):

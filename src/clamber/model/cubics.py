@@ -15,8 +15,14 @@ def smooth_slopes(x: np.ndarray, y: np.ndarray, ends: np.ndarray) -> np.ndarray:
         x: Increasing.
         y: At the nodes.
         ends: (2, k) slopes at the first and the last of them.
+
+    Raises:
+        ValueError: Nodes do not increase, or a number is not finite.
     """
     h = np.diff(x)[:, None]
+    finite = all(np.isfinite(a).all() for a in (x, y, ends))
+    if len(y) != len(x) or len(h) == 0 or not finite or h.min() <= 0.0:
+        raise ValueError("nodes that increase, with finite points")
     rise = np.diff(y, axis=0) / h
     inner = 3.0 * (h[1:] * rise[:-1] + h[:-1] * rise[1:])
     out = np.concatenate([ends[:1], inner, ends[1:]])
