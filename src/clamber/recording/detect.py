@@ -121,10 +121,10 @@ _SIGMAS = 4.5  # so many standard deviations of a smoothed track are no motion
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Tracks:
-    """Smoothed tracks of a demonstration, in a scene, with the thresholds."""
+    """Smoothed tracks of a demonstration, over supports, with the thresholds."""
 
     demo: Demonstration
-    scene: Scene
+    supports: tuple[Support, ...]
     options: DetectOptions
     position: np.ndarray  # (T, F, 3) [m]
     speeds: np.ndarray  # (T, F) [m/s]
@@ -231,7 +231,7 @@ def _smooth(demo: Demonstration, scene: Scene, options: DetectOptions) -> _Track
     velocity, position = local_quadratics(p, n, 1) / dt, local_quadratics(p, short, 0)
     speeds = np.linalg.norm(velocity, axis=2)
     noise = {n: noise_of(demo.point(n)) for n in demo.names}
-    return _Tracks(demo, scene, options, position, speeds, noise)
+    return _Tracks(demo, scene.supports, options, position, speeds, noise)
 
 
 def local_quadratics(x: np.ndarray, n: int, order: int) -> np.ndarray:
@@ -313,7 +313,7 @@ def _nearness(
     p, part = tracks.at(point), point.split(".")[0]
     able = tracks.valid(point) & _in_shape(tracks, part)
     slack = tracks.options.edge_slack
-    supports = tracks.scene.supports
+    supports = tracks.supports
     height = np.array([s.height(p) for s in supports])
     above = np.array([s.inside(p, -slack) for s in supports]) & (height > _UNDER)
     out = []
@@ -354,7 +354,7 @@ def _find_seats(tracks: _Tracks) -> list[list[tuple[int, int]]]:
     enter, leave = (_SEAT_SPEED * v for v in (options.enter_speed, options.exit_speed))
     seen = tracks.valid("LHip", "RHip")
     out = []
-    for support in tracks.scene.supports:
+    for support in tracks.supports:
         height = support.height(hips)
         over = support.inside(hips, -options.edge_slack) & (height > _SEAT_UNDER) & seen
         loose = over & (height < options.seat_height + options.height_slack)
@@ -410,7 +410,7 @@ def _part_intervals(
     demo, options = tracks.demo, tracks.options
     points = [p for p in demo.points_of(part) if p in near]
     least, about = options.min_duration * demo.rate, tracks.samples(options.smoothing)
-    for k, support in enumerate(tracks.scene.supports):
+    for k, support in enumerate(tracks.supports):
         loose = np.zeros((len(points), len(demo.t)), dtype=bool)
         strict = np.zeros_like(loose)
         for row, point in enumerate(points):
