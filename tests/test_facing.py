@@ -15,7 +15,7 @@ from clamber.model.facing import side_told
 from clamber.model.propose import Proposal, propose_robot
 from clamber.model.robot import Robot, load_robot
 from clamber.planning.diagnose import check_robot
-from clamber.run.folder import save_proposal
+from clamber.run.proposal import save_proposal
 
 BOTH_WAYS = ('range="-2.3 0.0"', 'range="-2.3 2.3"')
 

@@ -28,7 +28,7 @@ from clamber.planning.records import Budget, PlanOptions, Route
 from clamber.planning.search import Search
 from clamber.step.change import Failure, standing
 from clamber.step.ik import IK
-from clamber.step.stability import contact_drift
+from oracles import contact_drift
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,6 @@ from clamber.step.posture import (
     stability_cost,
 )
 from clamber.step.stability import (
-    contact_drift,
     contact_state,
     equilibrium_at,
     is_stable,
@@ -36,6 +35,7 @@ from clamber.step.stability import (
 )
 from clamber.step.statics import GRAVITY
 from clamber.step.tasks import EDGE_INSET, Closed, Sliding
+from oracles import contact_drift
 
 OUTER = {n: m for n, m in METHODS.items() if n != "direct"}
 UP = np.array([0.0, 0.0, 1.0])

@@ -28,7 +28,7 @@ from clamber.model.scene import Scene
 from clamber.model.tree import Tree, geom_points, geom_volume, joint_range
 from clamber.model.world import build_world
 from clamber.planning.diagnose import check_robot
-from clamber.run.folder import save_proposal
+from clamber.run.proposal import save_proposal
 from test_description import CUBE, stl
 
 TEXTS = {"mjcf": humanoids.mjcf, "urdf": humanoids.urdf}

@@ -30,7 +30,7 @@ from clamber.run.state import load_state
 from clamber.step.change import Failure
 from clamber.step.ik import IK
 from clamber.step.path import bridge, can_be_gone
-from clamber.step.stability import contact_drift
+from oracles import contact_drift
 
 OFFSETS = [(0.0, 0.0, 0.02), (0.0, 0.0, -0.03), (0.012, -0.01, 0.015)]
 

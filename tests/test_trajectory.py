@@ -22,7 +22,7 @@ from clamber.planning.trajectory import (
 )
 from clamber.step.ik import IK
 from clamber.step.path import straightened
-from clamber.step.stability import contact_points, statics_at
+from clamber.step.stability import statics_at
 from clamber.step.statics import Load, cone_generators, contact_forces
 
 
@@ -301,7 +301,7 @@ def test_a_contact_that_leaves_bears_less_and_less(demo_kinematics, knee_phases)
             continue
         kin = demo_kinematics
         kin.update(shift.q[0])  # the same posture: only the price differs
-        points = contact_points(kin, contacts)
+        points, *_ = statics_at(kin, shift.q[0], contacts)
         prices = [price[[c.surface for c in contacts].index(n)] for n in points.names]
         load = Load(com=kin.com.copy(), mass=kin.world.mass)
         f = contact_forces(points, load, price=np.array(prices)).forces

@@ -13,7 +13,7 @@ from clamber.errors import Status
 from clamber.model.se3 import matrix_from_rpy
 from clamber.step.ik import IK
 from clamber.step.polygon import com_margin, support_ellipse, support_polygon
-from clamber.step.stability import contact_drift, contact_points, equilibrium_at
+from clamber.step.stability import equilibrium_at, statics_at
 from clamber.step.transition import (
     MARGINS,
     approach_contact,
@@ -21,6 +21,7 @@ from clamber.step.transition import (
     plan_transition,
     rolled,
 )
+from oracles import contact_drift
 
 UP = np.array([0.0, 0.0, 1.0])
 AHEAD = np.array([1.0, 0.0, 0.0])
@@ -38,7 +39,7 @@ def ik(demo_plan):
 
 def polygon_of(kin, contacts) -> np.ndarray:
     """Support polygon of contacts at the present posture."""
-    return support_polygon(contact_points(kin, contacts).points[:, :2])
+    return support_polygon(statics_at(kin, kin.q, contacts)[0].points[:, :2])
 
 
 # The orientation of reach-to-support (4.26, 4.27).

@@ -31,8 +31,8 @@ from clamber.step.ik import IK
 from clamber.step.methods import direct
 from clamber.step.path import interpolate, overlap, watched_pairs
 from clamber.step.posture import KeyframeTask
-from clamber.step.stability import contact_drift
 from conftest import stairs
+from oracles import contact_drift
 from test_gait import FEET, POLICY, ROBOT, contact, row, table
 
 OPTIONS = PlanOptions()

@@ -89,7 +89,7 @@ _HOME = {
     "save_curves": "study.curves",
     "save_plan": "run.folder",
     "save_policy": "run.folder",
-    "save_proposal": "run.folder",
+    "save_proposal": "run.proposal",
     "save_rollout": "run.folder",
     "save_sequence": "run.folder",
     "save_verdict": "run.folder",

@@ -61,10 +61,10 @@ from clamber.run.folder import load_sequence as load_sequence
 from clamber.run.folder import new_run_folder as new_run_folder
 from clamber.run.folder import save_plan as save_plan
 from clamber.run.folder import save_policy as save_policy
-from clamber.run.folder import save_proposal as save_proposal
 from clamber.run.folder import save_rollout as save_rollout
 from clamber.run.folder import save_sequence as save_sequence
 from clamber.run.folder import save_verdict as save_verdict
+from clamber.run.proposal import save_proposal as save_proposal
 from clamber.show.live import open_view as open_view
 from clamber.show.pictures import draw_robot as draw_robot
 from clamber.show.pictures import draw_scene as draw_scene

@@ -45,7 +45,7 @@ void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, i
     lower_[0] = -1.0;
     for (int r = 0; r < 6 + na; ++r) {
         double* const row = &A_[r * n_];
-        std::copy_n(&rows_[r * nf], nf, row + 2);
+        std::copy_n(rows_.data() + r * nf, nf, row + 2);  // none where nothing bears
         const int at = n_ + r;
         if (r < 6) {
             row[0] = -moved[0][r] * u_max / share;

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
@@ -159,6 +158,8 @@ def _tile(
 
     Heights are smoothed white noise: like warped boards, higher here and lower there.
     """
+    from scipy.ndimage import gaussian_filter  # slow to import, and rarely needed
+
     geom = spec.geom(box.name)
     n = np.maximum(np.round(box.size[:2] / TILE), 1).astype(int)
     side = box.size[:2] / n

@@ -13,7 +13,7 @@ from clamber.planning.trajectory import Trajectory, build_trajectory
 from clamber.step.ik import IK
 from clamber.step.path import ARC_WEIGHT, Phase
 from clamber.step.polygon import com_margin, support_polygon
-from clamber.step.stability import contact_points
+from clamber.step.stability import statics_at
 from clamber.step.tasks import reaching
 from clamber.step.transition import balance_problem
 
@@ -41,9 +41,8 @@ def guarded_move(
     """
     ik = IK(world)
     free = _limb_over(world, contact)
-    ik.kin.update(q)
-    points = contact_points(ik.kin, held).points[:, :2]
-    room = com_margin(ik.kin.com[:2], support_polygon(points))
+    points, load, _ = statics_at(ik.kin, q, held)
+    room = com_margin(load.com[:2], support_polygon(points.points[:, :2]))
     if room <= 0:
         return None
     low, high = PROBE_MARGIN

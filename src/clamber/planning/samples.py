@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from clamber import _core
+from clamber.model import cubics
+from clamber.model.se3 import quat_conjugate, quat_multiply
 
 RATE = 1000.0  # [Hz]
 
@@ -135,7 +136,8 @@ class Spline:
     """One phase as a function of its path parameter, from 0 on.
 
     Attributes:
-        curve: Of the raw coordinates.
+        coefficients: (4, n - 1, nq) of the raw coordinates between two nodes each, from
+            the third power down.
         postures: (n, nq) that it goes through.
         nodes: (n,) of the path parameter.
         ends: (2, nq) its derivatives at the first and the last of them.
@@ -143,7 +145,7 @@ class Spline:
         tau: (g, na) feed-forward torques there [N m].
     """
 
-    curve: CubicSpline
+    coefficients: np.ndarray
     postures: np.ndarray
     nodes: np.ndarray
     ends: np.ndarray
@@ -161,7 +163,20 @@ class Spline:
 
     def along(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T, nq) postures, and (T, nv) their derivatives by the path parameter."""
-        return _core.along_spline(self.curve.c, self.nodes, np.ascontiguousarray(s))
+        return _core.along_spline(
+            self.coefficients, self.nodes, np.ascontiguousarray(s)
+        )
+
+    def bend(self, s: np.ndarray) -> np.ndarray:
+        """(T, nv) derivative of the tangent vector along the path."""
+        raw, slope, bend = cubics.along(self.coefficients, self.nodes, s)
+        norm = np.sum(raw[:, 3:7] ** 2, axis=1, keepdims=True)
+        inverse = quat_conjugate(raw[:, 3:7])
+        omega = 2.0 * quat_multiply(inverse, slope[:, 3:7])[:, 1:] / norm
+        stretch = 2.0 * np.sum(raw[:, 3:7] * slope[:, 3:7], axis=1, keepdims=True)
+        turn = 2.0 * quat_multiply(inverse, bend[:, 3:7])[:, 1:] / norm
+        turn -= stretch / norm * omega
+        return np.concatenate([bend[:, :3], turn, bend[:, 7:]], axis=1)
 
 
 def spline_through(
@@ -172,9 +187,9 @@ def spline_through(
     tau: np.ndarray,
 ) -> Spline:
     """The spline through postures (n, nq) at path parameters (n,); see `Spline`."""
-    clamped: Any = ((1, ends[0]), (1, ends[1]))
-    curve = CubicSpline(s, postures, bc_type=clamped)
-    return Spline(curve, postures, s, ends, grid, tau)
+    slopes = cubics.smooth_slopes(s, postures, ends)
+    c = cubics.pieces(s, postures, slopes)
+    return Spline(c, postures, s, ends, grid, tau)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

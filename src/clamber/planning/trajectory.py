@@ -18,12 +18,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.se3 import quat_conjugate, quat_multiply
+from clamber.model.se3 import quat_multiply
 from clamber.model.world import World
 from clamber.planning.samples import (
     RATE,
@@ -261,17 +260,6 @@ def _made(phases: Sequence[Phase], i: int) -> Contact | None:
     return next((c for c in after if (c.surface, c.support) not in before), None)
 
 
-def _bend(curve: CubicSpline, s: np.ndarray) -> np.ndarray:
-    """(n, nv) derivative of the tangent vector along the path."""
-    raw, slope, bend = curve(s), curve(s, 1), curve(s, 2)
-    norm = np.sum(raw[:, 3:7] ** 2, axis=1, keepdims=True)
-    inverse = quat_conjugate(raw[:, 3:7])
-    omega = 2.0 * quat_multiply(inverse, slope[:, 3:7])[:, 1:] / norm
-    stretch = 2.0 * np.sum(raw[:, 3:7] * slope[:, 3:7], axis=1, keepdims=True) / norm
-    turn = 2.0 * quat_multiply(inverse, bend[:, 3:7])[:, 1:] / norm - stretch * omega
-    return np.concatenate([bend[:, :3], turn, bend[:, 7:]], axis=1)
-
-
 def build_trajectory(
     world: World,
     phases: Sequence[Phase],
@@ -328,9 +316,9 @@ def _course(
         fine = (edge[:-1, None] + np.diff(edge)[:, None] * _SHARES).ravel()
         most = [
             largest(x).reshape(-1, len(_SHARES)).max(axis=1)
-            for x in (spline.along(fine)[1], _bend(spline.curve, fine))
+            for x in (spline.along(fine)[1], spline.bend(fine))
         ]
-        looked.append((*spline.along(middle), _bend(spline.curve, middle), *most))
+        looked.append((*spline.along(middle), spline.bend(middle), *most))
         edges.append(starts[i] + edge[1:])
         middles.append(middle)
         made = _made(phases, i)

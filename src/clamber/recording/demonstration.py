@@ -17,6 +17,7 @@ import numpy as np
 
 from clamber.contact.contact import PARTS
 from clamber.errors import InputError
+from clamber.model import cubics
 from clamber.model.records import short_repr
 from clamber.model.scene import Scene
 from clamber.model.shown import Shown
@@ -239,11 +240,10 @@ def _fill(
         if not missing:
             continue
         if ok.sum() > 1:
-            from scipy.interpolate import PchipInterpolator
-
-            curve = PchipInterpolator(t[ok], raw[ok, f], axis=0)
-            inside = np.clip(t[~ok], t[ok][0], t[ok][-1])
-            position[~ok, f] = curve(inside)
+            at, known = t[ok], raw[ok, f]
+            curve = cubics.pieces(at, known, cubics.monotone_slopes(at, known))
+            inside = np.clip(t[~ok], at[0], at[-1])
+            position[~ok, f], *_ = cubics.along(curve, at, inside)
         else:
             position[~ok, f] = raw[ok, f]
         for i, j in missing:

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import correlate1d
 
 from clamber.contact.contact import (
     PARTS,
@@ -122,10 +121,10 @@ _SIGMAS = 4.5  # so many standard deviations of a smoothed track are no motion
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Tracks:
-    """Smoothed tracks of a demonstration, in a scene, with the thresholds."""
+    """Smoothed tracks of a demonstration, over supports, with the thresholds."""
 
     demo: Demonstration
-    scene: Scene
+    supports: tuple[Support, ...]
     options: DetectOptions
     position: np.ndarray  # (T, F, 3) [m]
     speeds: np.ndarray  # (T, F) [m/s]
@@ -232,7 +231,7 @@ def _smooth(demo: Demonstration, scene: Scene, options: DetectOptions) -> _Track
     velocity, position = local_quadratics(p, n, 1) / dt, local_quadratics(p, short, 0)
     speeds = np.linalg.norm(velocity, axis=2)
     noise = {n: noise_of(demo.point(n)) for n in demo.names}
-    return _Tracks(demo, scene, options, position, speeds, noise)
+    return _Tracks(demo, scene.supports, options, position, speeds, noise)
 
 
 def local_quadratics(x: np.ndarray, n: int, order: int) -> np.ndarray:
@@ -251,12 +250,33 @@ def local_quadratics(x: np.ndarray, n: int, order: int) -> np.ndarray:
     fit = np.linalg.pinv(powers)  # coefficients of the quadratic, from the samples
     slopes = np.column_stack([np.zeros(n), np.ones(n), 2.0 * powers[:, 1]])
     at = (powers, slopes / half)[order] @ fit  # (n, n) values from the samples
-    out = correlate1d(x, at[half], axis=0, mode="constant")
+    out = np.empty_like(x)
+    out[half : len(x) - half] = correlated(x, at[half])
     for ends, rows in (
         (slice(None, n), slice(half)),
         (slice(-n, None), slice(-half, None)),
     ):
         out[ends][rows] = np.tensordot(at[rows], x[ends], axes=1)
+    return out
+
+
+def correlated(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(T - n + 1, ...) sums of n weights, an odd number, times the samples of tracks.
+
+    To the last bit those of SciPy, which is slow to import.
+    """
+    n = len(weights)
+    half, last = n // 2, len(x) - n + 1
+    for mirror in (1.0, -1.0):
+        if np.abs(weights - mirror * weights[::-1]).max() <= np.finfo(float).eps:
+            out = weights[half] * x[half:][:last]
+            for k in range(half):
+                both = x[k:][:last] + mirror * x[n - 1 - k :][:last]
+                out += both * weights[k]
+            return out
+    out = weights[-1] * x[n - 1 :]
+    for k in range(n - 1):
+        out += weights[k] * x[k:][:last]
     return out
 
 
@@ -293,7 +313,7 @@ def _nearness(
     p, part = tracks.at(point), point.split(".")[0]
     able = tracks.valid(point) & _in_shape(tracks, part)
     slack = tracks.options.edge_slack
-    supports = tracks.scene.supports
+    supports = tracks.supports
     height = np.array([s.height(p) for s in supports])
     above = np.array([s.inside(p, -slack) for s in supports]) & (height > _UNDER)
     out = []
@@ -334,7 +354,7 @@ def _find_seats(tracks: _Tracks) -> list[list[tuple[int, int]]]:
     enter, leave = (_SEAT_SPEED * v for v in (options.enter_speed, options.exit_speed))
     seen = tracks.valid("LHip", "RHip")
     out = []
-    for support in tracks.scene.supports:
+    for support in tracks.supports:
         height = support.height(hips)
         over = support.inside(hips, -options.edge_slack) & (height > _SEAT_UNDER) & seen
         loose = over & (height < options.seat_height + options.height_slack)
@@ -390,7 +410,7 @@ def _part_intervals(
     demo, options = tracks.demo, tracks.options
     points = [p for p in demo.points_of(part) if p in near]
     least, about = options.min_duration * demo.rate, tracks.samples(options.smoothing)
-    for k, support in enumerate(tracks.scene.supports):
+    for k, support in enumerate(tracks.supports):
         loose = np.zeros((len(points), len(demo.t)), dtype=bool)
         strict = np.zeros_like(loose)
         for row, point in enumerate(points):

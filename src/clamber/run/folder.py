@@ -31,10 +31,8 @@ from clamber.execution.simulation import Rollout
 from clamber.execution.verdict import Verdict
 from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
-from clamber.model.propose import Proposal, robot_yaml
 from clamber.model.robot import Robot
 from clamber.model.scene import Scene
-from clamber.model.shapes import MESH_FOLDER
 from clamber.model.world import World, index_world
 from clamber.planning.planner import Replanned
 from clamber.planning.records import Fallback, Plan
@@ -52,7 +50,7 @@ from clamber.run.codec import (
 from clamber.run.forms import CODEC
 from clamber.step.change import Change
 from clamber.step.posture import Keyframe
-from clamber.step.stability import contact_points
+from clamber.step.stability import statics_at
 
 SEQUENCE = "sequence.json"
 POLICY = "policy.json"
@@ -61,7 +59,6 @@ PLANNED_SCENE = "planned.xml"
 PLANNED_TRAJECTORY = "planned.npz"
 TRAJECTORY = "trajectory.npz"
 SCENE = "scene.xml"
-ROBOT = "robot.yaml"
 ASSETS = "assets"
 TIMINGS = "timings.json"
 ROLLOUT = "rollout.npz"
@@ -254,8 +251,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
 
 def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
     """A keyframe by the keys of `plan.json`, and where its forces act."""
-    kin.update(k.q)
-    points = contact_points(kin, k.stance)
+    points, *_ = statics_at(kin, k.q, k.stance)
     acting = {"surfaces": points.names, "points": points.points}
     out = CODEC.encode(k)
     out["static_equilibrium"] |= CODEC.encode(acting)
@@ -475,24 +471,6 @@ def _with_assets(root: ElementTree.Element, base: Path) -> dict[bytes, str]:
                 names[content] = unique
             element.set(key, f"{ASSETS}/{names[content]}")
     return names
-
-
-@checks_types
-def save_proposal(proposal: Proposal, folder: str | Path) -> None:
-    """Write `robot.yaml`, the model that it names, and meshes into a folder.
-
-    Args:
-        proposal: Of a robot.
-        folder: That exists.
-    """
-    files = {f"{MESH_FOLDER}/{n}": content for n, content in proposal.files.items()}
-    files[proposal.fields["model"]] = proposal.mjcf.encode()
-    files[ROBOT] = robot_yaml(proposal).encode()
-    for name, content in files.items():
-        path = Path(folder) / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as draft:
-            draft.write_bytes(content)
 
 
 def save_replanned(found: Replanned, folder: str | Path) -> None:

@@ -45,7 +45,7 @@ from clamber.run.folder import (
 )
 from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import Keyframe
-from clamber.step.stability import contact_points, statics_at
+from clamber.step.stability import statics_at
 from clamber.step.statics import (
     Phase,
     contact_forces,
@@ -232,9 +232,8 @@ def change_at(changes: Sequence[str], reached: Sequence[float | None], t: float)
 
 def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
     """(3,) [N] of each surface, over all its bearing points; zeros where unknown."""
-    kin = Kinematics(world)
-    kin.update(key.q)
-    names = np.array(contact_points(kin, key.stance).names)
+    points, *_ = statics_at(Kinematics(world), key.q, key.stance)
+    names = np.array(points.names)
     forces = key.equilibrium.forces
     if len(names) != len(forces):
         return {c.surface: np.zeros(3) for c in key.stance}

@@ -25,7 +25,8 @@ from clamber.model.world import build_world
 from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
-from clamber.run.folder import new_run_folder, next_free_folder, save_proposal
+from clamber.run.folder import new_run_folder, next_free_folder
+from clamber.run.proposal import save_proposal
 from clamber.show.framing import robot_corners
 from clamber.show.meshes import body_meshes, body_poses
 from clamber.show.page import Page, Work, paragraphs

@@ -80,24 +80,6 @@ def contact_state(kin: Kinematics, c: Contact, *, loaded: bool = True) -> Contac
     )
 
 
-def contact_points(kin: Kinematics, contacts: Sequence[Contact]) -> ContactPoints:
-    """The points of contacts that carry force, at the present posture."""
-    supports = [kin.world.supports[c.support] for c in contacts]
-    points = [
-        kin.bearing_points(c.surface, support.normal, c.edge)
-        for c, support in zip(contacts, supports, strict=True)
-    ]
-    counts = [len(p) for p in points]
-    return ContactPoints(
-        points=np.concatenate(points),
-        normals=np.repeat([s.normal for s in supports], counts, axis=0),
-        mu=np.repeat([s.friction for s in supports], counts),
-        names=[
-            c.surface for c, n in zip(contacts, counts, strict=True) for _ in range(n)
-        ],
-    )
-
-
 def statics_at(
     kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]
 ) -> tuple[ContactPoints, Load, TorqueLimits]:
@@ -204,10 +186,3 @@ def standing_share(world: World, stance: Sequence[Contact], q: np.ndarray) -> fl
     """
     over = [float(world.supports[c.support].height(q[:3])) for c in stance]
     return min(over) / float(world.home[2])
-
-
-def contact_drift(kin: Kinematics, c: Contact) -> float:
-    """Distance of a contact from where it should be at the present posture [m]."""
-    n = kin.world.supports[c.support].normal
-    p = kin.contact_point(c.surface, n, c.edge)
-    return float(np.linalg.norm(p - c.position - kin.roll(c.surface, n, c.link)))

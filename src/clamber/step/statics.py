@@ -19,7 +19,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linprog
 
 from clamber import _core
 from clamber.model.records import short_repr
@@ -347,6 +346,8 @@ def strength_needed(
     Returns:
         s, and the index into `torque.names`; None where no strength would do.
     """
+    from scipy.optimize import linprog  # slow to import, and rarely needed
+
     if len(contacts.points) == 0:
         return None
     weight = load.mass * GRAVITY
