@@ -562,7 +562,7 @@ def test_shadows_are_soft_and_lie_on_the_ground(plan: Plan, opengl: None):
     view = framing.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
     with renderer.Camera(world, size) as camera:
         shaded = np.asarray(camera.shot(world.home, view)).astype(int)
-        plain = camera._drawn(camera._frame, (0, 0, *size)).resize(size)
+        plain = camera._drawn(camera._frame, (0, 0, *size)).picture.resize(size)
         plain = np.asarray(plain).astype(int)
     darker = 1.0 - shaded.sum(axis=2) / np.maximum(plain.sum(axis=2), 1)
     assert darker.max() > 0.25
@@ -593,7 +593,7 @@ def test_what_is_drawn_over_what_stands_still_is_the_whole_picture(
             whole = np.asarray(camera.shot(q, view, [ball, *post])).astype(int)
             over = np.asarray(camera.shot(q, view, [ball], still)).astype(int)
             assert np.mean(np.abs(whole - over).max(axis=2) > 6) < 1e-3
-            part = camera._covered(view)
+            part = camera._covered(view)[1]
             is_whole = part == (0, 0, *size)
             assert is_whole == (size != (640, 360))  # of odd pixels there is no part
 
