@@ -54,6 +54,7 @@ EXTRA_SHAPES = 1500  # beside those of the model
 SUN, FILL, AMBIENT = 0.62, 0.26, 0.34  # of the light, colourless
 DOWN = np.array([0.0, 0.0, -1.0])
 SHADOW_MAP = 2048  # texels along a side
+SMALL = 1000  # lines of what is drawn, up to which a map of half the size will do
 SHADED = 1.0  # [distance of the camera] around what it looks at there are shadows
 SOFT = 0.012  # [height of the picture] how far a shadow's edge, or a line's, is seen
 WHOLE = 4  # pixels that are whole numbers of pixels of what is drawn for a video
@@ -166,8 +167,8 @@ class Camera:
         Args:
             world: What to draw.
             size: Width and height in pixels.
-            fine: Edges and shadows are drawn at twice the size, as for a picture that
-                is looked at for long; half as long without, as for those of a video.
+            fine: Edges are drawn at twice the size, as for a picture that is looked at
+                for long; half as long without, as for those of a video.
             cutout: For `cutout`; `shot` then lacks the ground.
         """
         self._gl: Any = None
@@ -176,9 +177,12 @@ class Camera:
         self._whole = 1 if fine else WHOLE
         scale = 2.0 if fine or cutout else 1.25
         self._frame = round(scale * size[0]), round(scale * size[1])
-        self._shade = self._frame if fine else (size[0] // 2, size[1] // 2)
-        model = _dressed(world, self._frame)
+        small = self._frame[1] <= SMALL
+        self._shade = size if small else self._frame
         if not fine:
+            self._shade = size[0] // 2, size[1] // 2
+        model = _dressed(world, self._frame)
+        if small:
             model.vis.quality.numslices, model.vis.quality.numstacks = 20, 10
             model.vis.quality.shadowsize = SHADOW_MAP // 2
         if cutout:
@@ -190,7 +194,7 @@ class Camera:
         self._gl = _gl_context(*self._frame)
         self._gl.make_current()
         self._contexts.append(_context(model))
-        if not fine and not _has_meshes(model, world):
+        if small and not _has_meshes(model, world):
             # Shadows are blurred: round shapes may have corners in them.
             model.vis.quality.numslices, model.vis.quality.numstacks = 12, 6
             model.vis.global_.offwidth, model.vis.global_.offheight = self._shade
