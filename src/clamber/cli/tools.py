@@ -176,7 +176,7 @@ class ViewCommand:
         tuple[str, ...], tyro.conf.Positional, shown("RUN|RECORDING", "a new climb")
     ] = ()
     """A run folder, whole or not, or several to lay side by side; a recording, or a
-    built-in demonstration by name. None: a page on which to choose and climb."""
+    built-in demonstration by name. Without any: a page on which to choose and climb."""
     demo: Annotated[str | None, shown("RECORDING|NAME", "the run's own")] = None
     """The recording that is shown beside a run."""
     scene: Annotated[Path | None, shown("FILE")] = None
@@ -327,7 +327,8 @@ class RobotCommand:
     action: tyro.conf.Positional[Literal["init", "check"]]
     """init: from an MJCF or URDF. check: a robot.yaml."""
     model: Annotated[str, tyro.conf.Positional, shown("MODEL")]
-    """init: an MJCF or URDF, or a humanoid of a wheel (g1, icub, romeo, talos).
+    """init: an MJCF or URDF, or a humanoid by name (g1, icub, romeo, talos), where a
+    package that has it is installed.
     check: a robot.yaml, or a robot by name."""
     effort: Annotated[Path | None, shown("FILE")] = None
     """init: effort limits the model lacks: YAML {joint: N m}, or another model."""
