@@ -340,6 +340,19 @@ def test_the_command_names_the_file_and_on_stderr_what_is_missing(
     assert "--out is" in capsys.readouterr().err
 
 
+def test_a_report_says_how_far_it_is(whole: Path, planned: Path, tmp_path: Path):
+    told: list[float] = []
+    report.write_report(
+        whole,
+        compare=planned,
+        out=tmp_path / "both.html",
+        progress=lambda stage, share, note: told.append(share),
+    )
+    assert told == sorted(told)
+    assert told[0] == 0.0
+    assert max(np.diff([*told, 1.0])) < 0.35
+
+
 # In a browser.
 
 

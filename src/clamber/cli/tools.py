@@ -158,9 +158,8 @@ class ReportCommand:
     def run(self) -> int:
         """Run to one page."""
         with self.output.progress(Track("report")) as report:
-            report("report", 0.0, "")
             files = {"compare": self.compare, "out": self.out}
-            done = clamber.write_report(self.run_folder, **files)
+            done = clamber.write_report(self.run_folder, **files, progress=report)
             report("report", 1.0, "")
         self.output.warn(*done.missing)
         record = {"file": str(done.file), "missing": list(done.missing)}
