@@ -15,8 +15,6 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && command -v $$p && break; done)
 # Whole files go to one worker, so that what they share is made once.
 PYTEST = -m pytest -n $(WORKERS) --dist loadfile
-# Tests of test-ci wait half of their time, for pages and other processes.
-test-ci: WORKERS := $(if $(filter auto,$(WORKERS)),$(shell echo $$(($$(nproc) + 1))),$(WORKERS))
 OUTSIDE = docs or pool or browser
 # What the native core is compiled from; a folder's date tells that a file came or went.
 NATIVE := CMakeLists.txt $(shell find src/native -not -path 'src/native/fuzz*')

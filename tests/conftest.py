@@ -277,25 +277,6 @@ def whole(one_hand_plan, one_hand_rollout, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def off_plan(
-    one_hand_plan, one_hand_rollout, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """The run, to the left of where it was planned."""
-    from dataclasses import replace
-
-    import clamber
-
-    folder = tmp_path_factory.mktemp("off_plan")
-    qpos = one_hand_rollout.qpos + 0.08 * (
-        np.arange(one_hand_rollout.qpos.shape[1]) == 1
-    )
-    clamber.save_plan(one_hand_plan, folder)
-    rollout = replace(one_hand_rollout, qpos=qpos)
-    clamber.save_rollout(one_hand_plan, rollout, folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def browser(request: pytest.FixtureRequest) -> Iterator[Any]:
     """Headless Chromium with a software renderer; a module may name its flags."""
     drawn = ["--use-gl=angle", "--use-angle=swiftshader"]  # all of it, as by a card

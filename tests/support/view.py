@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,8 +19,6 @@ from PIL import Image
 
 from clamber.show.live import open_view
 
-ENOUGH = 300  # pixels of orange: feet, hands, elbows and knees from any side
-PATIENCE = 90.0  # [s] with which a busy machine is waited for
 SIZE = {"width": 900, "height": 620}
 SCENE = {"x": 0, "y": 0, "width": 520, "height": 620}  # beside the panel
 # Where a point of the world is on the screen [px]; three.js has y up, we have z.
@@ -42,11 +39,11 @@ class Opened:
     complaints: list[str]
 
     def until(self, met: Callable[[], Any], told: object = "") -> None:
-        end = time.monotonic() + PATIENCE
-        while not met():
-            if time.monotonic() > end:
-                pytest.fail(f"it never came: {told}")
+        for _ in range(1800):  # a busy machine is waited for
+            if met():
+                return
             self.tab.wait_for_timeout(50)
+        pytest.fail(f"it never came: {told}")
 
     def row(self, label: str) -> Any:
         """What belongs to a label of the panel."""
@@ -77,22 +74,14 @@ class Opened:
 
     def still(self) -> np.ndarray:
         """The picture, once it changes no more."""
-        pictures = [self.picture()]
-
-        def rests() -> bool:
-            pictures.append(self.picture())
-            return np.array_equal(*pictures[-2:])
-
-        self.tab.wait_for_timeout(150)
-        self.until(rests, "rest")
-        return pictures[-1]
-
-    def go(self, t: float) -> np.ndarray:
-        """The picture at a time, once the page has got there and is at rest."""
-        self.page.clock.go(t)
-        told = f"{t:.2f} of {self.page.clock.end:.1f} s"
-        self.until(lambda: told in self.tab.inner_text("body"), told)
-        return self.still()
+        before = self.picture()
+        for _ in range(40):
+            self.tab.wait_for_timeout(200)
+            now = self.picture()
+            if np.array_equal(before, now):
+                return now
+            before = now
+        pytest.fail("it does not come to rest")
 
     def orange(self) -> int:
         """Pixels of the robot."""
@@ -102,11 +91,6 @@ class Opened:
         """Pixels of the person."""
         r, g, b = np.moveaxis(self.picture(), 2, 0)
         return int(np.sum((b > 1.2 * r) & (b > 1.05 * g) & (r > 60)))
-
-
-def client_of(view: Opened) -> Any:
-    """The tab's connection: the last, where a busy browser had to connect again."""
-    return list(view.page.server.get_clients().values())[-1]
 
 
 def orange_in(picture: np.ndarray) -> np.ndarray:
@@ -122,17 +106,12 @@ def served(
     query: str = "",
     size: dict[str, int] | None = None,
     ready: str = 'text="speed"',
-    page: Any = None,
 ):
-    """A page of some sources in a tab, which asks for nothing from elsewhere.
-
-    `page`: One that is open, and stays so.
-    """
+    """A page of some sources in a tab, which asks for nothing from elsewhere."""
     source, *beside = sources or (None,)
-    own = open_view(source, beside=beside, port=18090) if page is None else None
-    page, complaints = page or own, []
+    page, complaints = open_view(source, beside=beside, port=18090), []
     tab = browser.new_context(viewport=size or SIZE).new_page()
-    tab.set_default_timeout(1000 * PATIENCE)
+    tab.set_default_timeout(40_000)
     tab.on("pageerror", lambda e: complaints.append(str(e)))
     tab.on("console", lambda m: m.type == "error" and complaints.append(m.text))
 
@@ -152,7 +131,6 @@ def served(
         yield opened
         if complaints:
             pytest.fail(str(complaints))
-    finally:
         tab.context.close()
-        if own is not None:
-            own.close()
+    finally:
+        page.close()
