@@ -148,13 +148,14 @@ $(VENV)/.has-core: pyproject.toml constraints.txt $(NATIVE) | $(VENV)/.can-build
 		wait $$! && exit $$built
 	@mv $@.begun $@
 
-# What compiles it: CMake and Ninja are the system's where it has them.
+# What compiles it: CMake and Ninja are the system's where it has them. The pip of this
+# environment is as old as Python and takes twice as long to look packages up.
 %/.can-build: pyproject.toml constraints.txt | %/bin/python
 	@command -v "$${CXX:-c++}" g++ clang++ >/dev/null || { \
 		echo "clamber is compiled with a C++17 compiler and found none: apt-get install g++ (Debian, Ubuntu), or name one with make CXX=..." >&2; exit 1; }
 	@$*/bin/python -c 'import pathlib, sysconfig as s; (pathlib.Path(s.get_path("include")) / "Python.h").stat()' 2>/dev/null || { \
 		echo "$(PYTHON) has no headers to compile against: apt-get install python3-dev (Debian, Ubuntu), or name another with make PYTHON=..." >&2; exit 1; }
-	@$*/bin/python $(PIP) -c constraints.txt nanobind scikit-build-core
+	@$*/bin/python $(PIP) -c constraints.txt pip nanobind scikit-build-core
 	@needed=$$($*/bin/python -c 'import scikit_build_core.build as b; print(*b.get_requires_for_build_wheel())'); \
 		[ -z "$$needed" ] || $*/bin/python $(PIP) -c constraints.txt $$needed
 	@touch $@

@@ -529,6 +529,7 @@ ODD = re.compile(
     r"holds a push|\d weights\b|felt (for|on the way)|(parts|links?) that (is|are) no "
     r"surface|way of the (limb|surface)|did not make it|made it all the same|got there"
     r"|what is (only )?seen of|mass inside \[|probed for (again|in vain)|asked of key"
+    r"|red outside of it"
 )
 
 

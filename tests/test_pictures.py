@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -562,7 +563,7 @@ def test_shadows_are_soft_and_lie_on_the_ground(plan: Plan, opengl: None):
     view = framing.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
     with renderer.Camera(world, size) as camera:
         shaded = np.asarray(camera.shot(world.home, view)).astype(int)
-        plain = camera._drawn(camera._frame, (0, 0, *size)).resize(size)
+        plain = camera._drawn(camera._frame, (0, 0, *size)).picture.resize(size)
         plain = np.asarray(plain).astype(int)
     darker = 1.0 - shaded.sum(axis=2) / np.maximum(plain.sum(axis=2), 1)
     assert darker.max() > 0.25
@@ -573,8 +574,9 @@ def test_shadows_are_soft_and_lie_on_the_ground(plan: Plan, opengl: None):
 
 @pytest.mark.parametrize("robot", ["coman", "coman29"])
 @pytest.mark.parametrize("size", [(640, 360), (322, 182)])
+@pytest.mark.parametrize("glass", [False, True])
 def test_what_is_drawn_over_what_stands_still_is_the_whole_picture(
-    robot: str, size: tuple[int, int], opengl: None
+    robot: str, size: tuple[int, int], glass: bool, opengl: None
 ):
     """Shadows that move are moved, those that stay are kept."""
     scene = clamber.Scene.from_height(0.3)
@@ -586,16 +588,71 @@ def test_what_is_drawn_over_what_stands_still_is_the_whole_picture(
     at = seen.max(axis=0)
     view = framing.view_of(world, seen, size[0] / size[1])
     post = renderer.block(np.full(3, 0.2), at, np.eye(3), (0.2, 0.4, 0.9, 1.0))
-    ball = renderer.ball(at - [0.0, 0.4, 0.3], 0.1, (0.9, 0.4, 0.2, 1.0))
+    colour = (0.9, 0.4, 0.2, 0.5 if glass else 1.0)
+    ball = renderer.ball(at - [0.0, 0.4, 0.3], 0.1, colour)
     with renderer.Camera(world, size, fine=False) as camera:
         still = camera.still(view, post)
         for q in ways:
             whole = np.asarray(camera.shot(q, view, [ball, *post])).astype(int)
             over = np.asarray(camera.shot(q, view, [ball], still)).astype(int)
             assert np.mean(np.abs(whole - over).max(axis=2) > 6) < 1e-3
-            part = camera._covered(view)
+            part = camera._covered(view)[1]
             is_whole = part == (0, 0, *size)
             assert is_whole == (size != (640, 360))  # of odd pixels there is no part
+
+
+def test_of_a_frame_only_what_moves_is_drawn_anew(plan: Plan, opengl: None):
+    """Ground and boxes cost most of a picture; they are kept, with their depth."""
+    world, size = plan.world, (640, 360)
+    view = framing.view_of(world, in_view(world, world.home[None]), size[0] / size[1])
+    drawn: list[tuple[int, bool]] = []
+    with renderer.Camera(world, size, fine=False) as camera:
+        still, draw = camera.still(view), camera._drawn
+
+        def counted(size, part, *, movers=False, shadows=False):
+            drawn.append((size[0], movers or shadows))
+            return draw(size, part, movers=movers, shadows=shadows)
+
+        camera._drawn = counted
+        camera.shot(world.home, view, still=still)
+        assert drawn == [(800, True), (320, True), (320, True)]
+        assert len(camera._moving) < camera._scene.ngeom - 12
+
+
+def test_two_cameras_draw_the_video_of_one(
+    plan: Plan,
+    rollout: Rollout,
+    tmp_path: Path,
+    opengl: None,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    files = []
+    for cameras in (1, 2):
+        monkeypatch.setattr(film, "CAMERAS", cameras)
+        out = tmp_path / f"{cameras}.webp"
+        files.append(film.video(plan, rollout, tmp_path, out=out, size=SIZE))
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_what_threads_make_in_turns_is_in_order_and_ends_with_its_reader():
+    made: list[int] = []
+
+    def share(of: range):
+        for i in of:
+            made.append(i)
+            yield i
+            if i == 40:
+                raise ValueError("no picture")
+
+    assert list(film.taking_turns(share, 9, 2)) == list(range(9))
+    with pytest.raises(ValueError, match="no picture"):
+        list(film.taking_turns(share, 60, 2))
+    before = threading.active_count()
+    turns = film.taking_turns(share, 10_000, 3)
+    assert next(turns) == 0
+    turns.close()
+    assert threading.active_count() == before
+    assert max(made) < 100  # none runs ahead of its reader
 
 
 def test_no_phase_of_a_contact_is_red():

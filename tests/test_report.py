@@ -340,6 +340,19 @@ def test_the_command_names_the_file_and_on_stderr_what_is_missing(
     assert "--out is" in capsys.readouterr().err
 
 
+def test_a_report_says_how_far_it_is(whole: Path, planned: Path, tmp_path: Path):
+    told: list[float] = []
+    report.write_report(
+        whole,
+        compare=planned,
+        out=tmp_path / "both.html",
+        progress=lambda stage, share, note: told.append(share),
+    )
+    assert told == sorted(told)
+    assert told[0] == 0.0
+    assert max(np.diff([*told, 1.0])) < 0.35
+
+
 # In a browser.
 
 
@@ -363,7 +376,7 @@ def opened(browser: Any, file: Path, **options: Any) -> tuple[Any, list[str]]:
 
 def until(page: Any, condition: str) -> None:
     """Wait for an expression; the page's policy forbids that Playwright does."""
-    for _ in range(200):
+    for _ in range(1800):  # a busy machine is waited for
         if page.evaluate(condition):
             return
         page.wait_for_timeout(50)

@@ -60,13 +60,13 @@ def test_the_start_page_offers_a_robot_of_a_wheel_and_makes_it_once(site: Path):
     start = pytest.importorskip("clamber.show.start")
     assert "icub" not in start.known_robots().values()
     install(site, *MODELS["icub"][0], mjcf())
-    assert start.known_robots()["icub (of a wheel)"] == "icub"
+    assert start.known_robots()["icub (from a package)"] == "icub"
     start.make_of_wheel("icub")
     made = clamber.load_robot("icub")
     start.make_of_wheel("icub")  # it is there
     start.make_of_wheel("coman")  # and no wheel's
     assert Path(start.known_robots()["robots/icub"]).parent == made.path.parent
-    assert "icub (of a wheel)" not in start.known_robots()
+    assert "icub (from a package)" not in start.known_robots()
 
 
 def test_effort_limits_come_from_the_wheel_that_has_them(site: Path):

@@ -39,7 +39,7 @@ class Opened:
     complaints: list[str]
 
     def until(self, met: Callable[[], Any], told: object = "") -> None:
-        for _ in range(400):
+        for _ in range(1800):  # a busy machine is waited for
             if met():
                 return
             self.tab.wait_for_timeout(50)

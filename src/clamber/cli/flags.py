@@ -64,7 +64,7 @@ def _left_out(
         metavar={int: "N", float: "X", str: "TEXT", Path: "FILE"}[kind],
         instance_from_str=value,
         is_instance=lambda x: x is None or isinstance(x, kind),
-        str_from_instance=lambda x: [str(x)],
+        str_from_instance=lambda x: ["unset" if x is None else str(x)],
     )
 
 

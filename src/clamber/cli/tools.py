@@ -158,9 +158,8 @@ class ReportCommand:
     def run(self) -> int:
         """Run to one page."""
         with self.output.progress(Track("report")) as report:
-            report("report", 0.0, "")
             files = {"compare": self.compare, "out": self.out}
-            done = clamber.write_report(self.run_folder, **files)
+            done = clamber.write_report(self.run_folder, **files, progress=report)
             report("report", 1.0, "")
         self.output.warn(*done.missing)
         record = {"file": str(done.file), "missing": list(done.missing)}
@@ -176,7 +175,7 @@ class ViewCommand:
         tuple[str, ...], tyro.conf.Positional, shown("RUN|RECORDING", "a new climb")
     ] = ()
     """A run folder, whole or not, or several to lay side by side; a recording, or a
-    built-in demonstration by name. None: a page on which to choose and climb."""
+    built-in demonstration by name. Without any: a page on which to choose and climb."""
     demo: Annotated[str | None, shown("RECORDING|NAME", "the run's own")] = None
     """The recording that is shown beside a run."""
     scene: Annotated[Path | None, shown("FILE")] = None
@@ -327,7 +326,8 @@ class RobotCommand:
     action: tyro.conf.Positional[Literal["init", "check"]]
     """init: from an MJCF or URDF. check: a robot.yaml."""
     model: Annotated[str, tyro.conf.Positional, shown("MODEL")]
-    """init: an MJCF or URDF, or a humanoid of a wheel (g1, icub, romeo, talos).
+    """init: an MJCF or URDF, or a humanoid by name (g1, icub, romeo, talos), where a
+    package that has it is installed.
     check: a robot.yaml, or a robot by name."""
     effort: Annotated[Path | None, shown("FILE")] = None
     """init: effort limits the model lacks: YAML {joint: N m}, or another model."""

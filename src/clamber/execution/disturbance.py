@@ -30,24 +30,24 @@ class Disturbance:
     """What the planner does not know.
 
     Attributes:
-        height: Every box is higher by this [m].
-        unevenness: Tops are warped: by `seed`, tiles whose heights are off by up to
-            this [m].
+        height: Boxes are higher than planned by this [m].
+        unevenness: Tops of boxes are uneven: tiles, drawn by `seed`, are up to this
+            much [m] too high or too low.
         roll: Boxes are tilted by this [rad] about x, through the middle of their near
             edge.
         pitch: Boxes are tilted by this [rad] about their near edge; positive: the far
             end sinks.
-        friction: Coulomb coefficient of ground and boxes; None: as in the scene.
-        x: The robot starts off by this [m].
-        y: The robot starts off by this [m].
-        yaw: The robot starts turned by this [rad].
+        friction: Coulomb coefficient of ground and boxes, where not the scene's.
+        x: Error of the start position along x [m].
+        y: Error of the start position along y [m].
+        yaw: Error of the start heading [rad].
         mass: Factor on the masses and inertias of all links.
         effort: Factor on the effort limits of all joints.
         delay: From sensing to command [s]; whole milliseconds.
-        noise: Factor on the noise of the sensors.
+        noise: Factor on the sensors' noise.
         push: Horizontal force [N] on the pelvis for 0.2 s; by `seed`, its time and its
             direction.
-        seed: Of noise, tiles and push.
+        seed: Of the random numbers: noise, tiles, push.
     """
 
     height: float = 0.0

@@ -8,10 +8,14 @@ Shapes: T samples, k pictures.
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
-from collections.abc import Iterable, Iterator
+import queue
+import sys
+import threading
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import mujoco
 import numpy as np
@@ -47,10 +51,13 @@ from clamber.show.skeleton import (
     skeleton_of,
 )
 
+T = TypeVar("T")
 Marks = Literal["none", "contacts", "forces"]
 FPS = 20
 VIDEO_SIZE, WEBP_SIZE = (1280, 720), (640, 360)
 VIDEO_SECONDS = 15.0  # at most, for runs that a power of two brings below
+CAMERAS = 2  # that draw side by side
+AHEAD = 4  # pictures that each may be ahead of what is written
 SPEEDUP_AFTER = 12.0  # [s] shorter runs are shown in real time
 PERSON: Colour = (0.20, 0.42, 0.68, 1.0)
 PERSON_BOX: Colour = (0.84, 0.80, 0.74, 1.0)
@@ -192,7 +199,7 @@ def video(
     size = size or usual
     tell = report or silent
     frames = _frames(plan, rollout, fps, size, camera, marks, skeleton, tell)
-    with whole_file(path) as draft:
+    with whole_file(path) as draft, contextlib.closing(frames):
         if path.suffix == ".mp4":
             _write_mp4(frames, draft, size)
         else:
@@ -218,7 +225,7 @@ def _frames(
     marks: Marks,
     skeleton: Skeleton | None,
     report: Progress,
-) -> Iterator[Image.Image]:
+) -> Generator[Image.Image]:
     """Pictures of the rollout with its clock and the move under way."""
     world, duration = rollout.world, float(rollout.time[-1])
     speedup = speedup_of(duration)
@@ -241,29 +248,93 @@ def _frames(
         for name, points in ((world.robot.name, seen), (person.name, person.points)):
             at = view.project(points, size)[:, 0]
             named.append((name, _middle(at)))
-    with Camera(world, size, fine=False) as drawing:
-        still = drawing.still(view, () if person is None else person.boxes)
-        for i, (row, t) in enumerate(zip(rows, times, strict=True)):
+
+    def drawn(share: range) -> Generator[Image.Image]:
+        """Some of the pictures, by a camera of their own."""
+        kin = Kinematics(world)
+        with Camera(world, size, fine=False) as drawing:
+            still = drawing.still(view, () if person is None else person.boxes)
+            for i in share:
+                row, t = rows[i], times[i]
+                shapes: list[Shape] = []
+                if person is not None and paired is not None:
+                    shapes = person.figure(float(np.interp(t, *paired)))
+                picture = drawing.shot(rollout.qpos[row], view, shapes, still)
+                if marks != "none":
+                    kin.update(rollout.qpos[row])
+                    with_forces = forces[i] if marks == "forces" else None
+                    points = contact_marks(kin, loaded[i], with_forces)
+                    draw_marks(picture, view, points)
+                text = change_at(moves, reached, t)
+                clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
+                below = size[1] - letters // 2
+                words = [(letters, below, clock, "ls")]
+                words += [(size[0] - letters, below, text, "rs")]
+                words += [(x, letters // 2, name, "ma") for name, x in named]
+                draw = ImageDraw.Draw(picture)
+                for x, y, word, anchor in words:
+                    draw.text(
+                        (x, y), word, font=font(letters), fill=DARK, anchor=anchor
+                    )
+                yield picture
+
+    # Much of a picture is made by one core alone. Elsewhere than on Linux a context is
+    # the first thread's.
+    beside = min(CAMERAS, len(rows)) if sys.platform == "linux" else 1
+    pictures = taking_turns(drawn, len(rows), beside)
+    with contextlib.closing(pictures):
+        for i, picture in enumerate(pictures):
             if i % 5 == 0:
                 report("video", i / len(rows), "")
-            shapes: list[Shape] = []
-            if person is not None and paired is not None:
-                shapes = person.figure(float(np.interp(t, *paired)))
-            picture = drawing.shot(rollout.qpos[row], view, shapes, still)
-            if marks != "none":
-                kin.update(rollout.qpos[row])
-                with_forces = forces[i] if marks == "forces" else None
-                draw_marks(picture, view, contact_marks(kin, loaded[i], with_forces))
-            text = change_at(moves, reached, t)
-            clock = f"{t:5.1f} s" + (f"   {speedup}x" if speedup > 1 else "")
-            below = size[1] - letters // 2
-            words = [(letters, below, clock, "ls")]
-            words += [(size[0] - letters, below, text, "rs")]
-            words += [(x, letters // 2, name, "ma") for name, x in named]
-            draw = ImageDraw.Draw(picture)
-            for x, y, word, anchor in words:
-                draw.text((x, y), word, font=font(letters), fill=DARK, anchor=anchor)
             yield picture
+
+
+def taking_turns(
+    made: Callable[[range], Generator[T]], count: int, workers: int
+) -> Generator[T]:
+    """What threads make, each every so many of it, in order.
+
+    Args:
+        made: Makes those of its share, in a thread of their own.
+        count: Of all.
+        workers: Threads.
+    """
+    if workers < 2:
+        yield from made(range(count))
+        return
+    over = threading.Event()
+    lines: list[queue.Queue[T | BaseException]] = [
+        queue.Queue(AHEAD) for _ in range(workers)
+    ]
+
+    def put(line: queue.Queue[T | BaseException], one: T | BaseException) -> None:
+        while not over.is_set():
+            with contextlib.suppress(queue.Full):
+                return line.put(one, timeout=0.1)
+
+    def work(k: int) -> None:
+        try:
+            with contextlib.closing(made(range(k, count, workers))) as ones:
+                for one in ones:
+                    put(lines[k], one)
+                    if over.is_set():
+                        break
+        except BaseException as e:
+            put(lines[k], e)
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(workers)]
+    for thread in threads:
+        thread.start()
+    try:
+        for i in range(count):
+            one = lines[i % workers].get()
+            if isinstance(one, BaseException):
+                raise one
+            yield one
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
 
 
 def _write_mp4(

@@ -65,7 +65,7 @@ from clamber.show.skeleton import skeleton_of
 from clamber.step.posture import Keyframe
 
 CLIMB_FRAMES = 12
-PLOTS = 14.0  # of a run take as long as so many pictures of a sheet
+PLOTS = 24.0  # of a run take as long as so many pictures of a sheet
 SAMPLES = 400  # of a plot over time
 FRAME_SIZE = (1920, 1080)
 CLOSE = 0.12  # [height of the motion] around it boxes are in a sheet's pictures
@@ -197,10 +197,11 @@ def keyframe_sheet(
     view = view_of(world, seen, tile[0] / tile[1], camera)
     tiles, steps = [], [None, *(c.step for c in plan.changes)]
     with Camera(world, tile) as drawing:
+        still = drawing.still(view)
         for i, key in enumerate(plan.keyframes):
             if report is not None:
                 report("pictures", i / len(plan.keyframes), "keyframes")
-            picture = drawing.shot(key.q, view)
+            picture = drawing.shot(key.q, view, still=still)
             mark_keyframe(picture, view, world, key)
             tiles.append((picture, keyframe_caption(i, key, steps[i])))
     return _save_sheet(tiles, path, columns=min(4, len(tiles)))
@@ -253,10 +254,11 @@ def climb_sheet(
     view = view_of(rollout.world, seen, tile[0] / tile[1])
     tiles = []
     with Camera(rollout.world, tile) as camera:
+        still = camera.still(view)
         for i, row in enumerate(rows):
             if report is not None:
                 report("pictures", i / len(rows), "climb")
-            picture = camera.shot(rollout.qpos[row], view)
+            picture = camera.shot(rollout.qpos[row], view, still=still)
             tiles.append((picture, [f"{rollout.time[row]:.1f} s"]))
     return _save_sheet(tiles, path, columns=4, colours=200)
 

@@ -33,6 +33,7 @@ from clamber.show.meshes import SHOWN_GROUPS, geom_colour
 STEEP = 70.0  # [deg] elevation from which a camera has no ahead of its own
 Colour = tuple[float, float, float, float]  # in [0, 1]
 Shape = Callable[[mujoco.MjvGeom], None]  # makes itself of a geom that is drawn
+_Part = tuple[int, int, int, int]  # left, top, right and bottom [pixels]
 GROUND_SHOWN = 60.0  # [m] half width of the ground in pictures
 FOG = (1.3, 4.0)  # [distance of the camera] where the ground begins and ends to fade
 HORIZON, GROUND_COLOUR, GRID_COLOUR = (
@@ -53,6 +54,7 @@ EXTRA_SHAPES = 1500  # beside those of the model
 SUN, FILL, AMBIENT = 0.62, 0.26, 0.34  # of the light, colourless
 DOWN = np.array([0.0, 0.0, -1.0])
 SHADOW_MAP = 2048  # texels along a side
+SMALL = 1000  # lines of what is drawn, up to which a map of half the size will do
 SHADED = 1.0  # [distance of the camera] around what it looks at there are shadows
 SOFT = 0.012  # [height of the picture] how far a shadow's edge, or a line's, is seen
 WHOLE = 4  # pixels that are whole numbers of pixels of what is drawn for a video
@@ -111,18 +113,37 @@ def _gl_context(width: int, height: int) -> Any:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Layer:
+    """What is drawn of a scene, with its depth.
+
+    Attributes:
+        picture: Of the size of what is drawn, not of what is seen.
+        depth: (height, width) in [0, 1], 0 at the camera.
+    """
+
+    picture: Image.Image
+    depth: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Still:
     """What does not move, drawn from one view.
 
     Attributes:
         shapes: Beside the scene.
-        picture: Without shadows.
+        colour: Without shadows.
+        lit: The same in the size in which shadows are drawn.
+        plain: `colour` in the size that is seen.
         left: Share of the light that shadows leave.
+        picture: All of it.
     """
 
     shapes: Sequence[Shape]
-    picture: Image.Image
+    colour: Layer
+    lit: Layer
+    plain: Image.Image
     left: Image.Image
+    picture: Image.Image
 
 
 class Camera:
@@ -141,22 +162,27 @@ class Camera:
         fine: bool = True,
         cutout: bool = False,
     ) -> None:
-        """Open a context.
+        """Open a context of this thread.
 
         Args:
             world: What to draw.
             size: Width and height in pixels.
-            fine: Edges and shadows are drawn at twice the size, as for a picture that
-                is looked at for long; half as long without, as for those of a video.
+            fine: Edges are drawn at twice the size, as for a picture that is looked at
+                for long; half as long without, as for those of a video.
             cutout: For `cutout`; `shot` then lacks the ground.
         """
         self._gl: Any = None
-        self._context: Any = None
+        self._contexts: list[mujoco.MjrContext] = []
         self._size = size
+        self._whole = 1 if fine else WHOLE
         scale = 2.0 if fine or cutout else 1.25
-        width, height = round(scale * size[0]), round(scale * size[1])
-        model = _dressed(world, (width, height))
+        self._frame = round(scale * size[0]), round(scale * size[1])
+        small = self._frame[1] <= SMALL
+        self._shade = size if small else self._frame
         if not fine:
+            self._shade = size[0] // 2, size[1] // 2
+        model = _dressed(world, self._frame)
+        if small:
             model.vis.quality.numslices, model.vis.quality.numstacks = 20, 10
             model.vis.quality.shadowsize = SHADOW_MAP // 2
         if cutout:
@@ -164,16 +190,17 @@ class Camera:
             model.geom_rgba[world.support_geom[GROUND], 3] = 0.0
         self._model, self._data = model, mujoco.MjData(model)
         self._fovy = float(model.vis.global_.fovy)
-        own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
-        self._robot = frozenset(np.flatnonzero(own).tolist())
         self._low = _lowest(model)
-        self._gl = _gl_context(width, height)
+        self._gl = _gl_context(*self._frame)
         self._gl.make_current()
-        self._context = mujoco.MjrContext(
-            model, mujoco.mjtFontScale.mjFONTSCALE_100.value
-        )
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._contexts.append(_context(model))
+        if small and not _has_meshes(model, world):
+            # Shadows are blurred: round shapes may have corners in them.
+            model.vis.quality.numslices, model.vis.quality.numstacks = 12, 6
+            model.vis.global_.offwidth, model.vis.global_.offheight = self._shade
+            self._contexts.append(_context(model))
         self._scene = mujoco.MjvScene(model, maxgeom=model.ngeom + EXTRA_SHAPES)
+        self._movers = mujoco.MjvScene(model, maxgeom=model.ngeom + EXTRA_SHAPES)
         self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         boxes = world.scene.boxes if not cutout else ()
         self._edges = [
@@ -185,8 +212,6 @@ class Camera:
             for s in mesh.supports[:MOST_EDGED]:
                 self._edges += outline(s.vertices + EDGE_LIFT * s.normal, EDGE_COLOUR)
         self._caps = _joint_caps(model, world)
-        self._frame = (width, height)
-        self._shade = (width, height) if fine else (size[0] // 2, size[1] // 2)
 
     def __enter__(self) -> Camera:
         """Itself."""
@@ -194,8 +219,8 @@ class Camera:
 
     def __exit__(self, *error: object) -> None:
         """Free the context."""
-        if self._context is not None:
-            self._context.free()
+        for context in self._contexts:
+            context.free()
         if self._gl is not None:
             self._gl.free()
 
@@ -212,65 +237,123 @@ class Camera:
             q: Of the robot.
             view: From where.
             shapes: Beside the robot.
-            still: What `still` drew from there. Only what robot and shapes cover, or
-                put in shadow, is drawn anew, in a third of the time.
+            still: What `still` drew from there. Only robot and shapes are drawn anew,
+                and what they put in shadow, in a fraction of the time.
         """
         self._update(q, view, shapes, () if still is None else still.shapes)
+        whole = (0, 0, *self._size)
         if still is None:
-            return self._shaded(*self._layers(0, 0, *self._size))
-        part = self._covered(view)
-        picture, left = still.picture.copy(), still.left.copy()
-        for layer, piece in zip((picture, left), self._layers(*part), strict=True):
-            at = [round(x * layer.width / self._size[0]) for x in part[:2]]
-            layer.paste(piece, (at[0], at[1]))
-        return self._shaded(picture, left)
+            colour, lit = self._unshaded()
+            left = self._left(whole, lit.picture)
+            plain = colour.picture.resize(self._size, Image.Resampling.BOX)
+            return ImageChops.multiply(plain, self._soft(left, whole))
+        near, around = self._covered(view)
+        plain = still.plain.copy()
+        piece = self._over(still.colour, self._frame, near)
+        wide, high = near[2] - near[0], near[3] - near[1]
+        plain.paste(piece.resize((wide, high), Image.Resampling.BOX), near[:2])
+        left = still.left.copy()
+        lit = self._over(still.lit, self._shade, around)
+        at = _scaled(around, self._size, self._shade)
+        left.paste(self._left(around, lit), at[:2])
+        picture = still.picture.copy()
+        soft = self._soft(left, around)
+        picture.paste(ImageChops.multiply(plain.crop(around), soft), around[:2])
+        return picture
 
     def still(self, view: View, shapes: Sequence[Shape] = ()) -> Still:
         """The scene without its robot, and shapes: what does not move in a video."""
         q = self._model.qpos0.copy()
         q[:3] = view.lookat + FAR_AWAY * view.axes[0]
         self._update(q, view, (), shapes)
-        picture, left = self._layers(0, 0, *self._size)
-        return Still(shapes=shapes, picture=picture, left=left)
+        whole = (0, 0, *self._size)
+        colour, lit = self._unshaded()
+        left = self._left(whole, lit.picture)
+        plain = colour.picture.resize(self._size, Image.Resampling.BOX)
+        return Still(
+            shapes=shapes,
+            colour=colour,
+            lit=lit,
+            plain=plain,
+            left=left,
+            picture=ImageChops.multiply(plain, self._soft(left, whole)),
+        )
 
-    def _layers(self, *part: int) -> tuple[Image.Image, Image.Image]:
-        """Part of a picture without shadows, and the share of light left by them."""
-        w, h = part[2] - part[0], part[3] - part[1]
-        picture = self._drawn(self._frame, part).resize((w, h), Image.Resampling.BOX)
-        lit = np.asarray(self._drawn(self._shade, part), dtype=np.float32)
-        shaded = self._drawn(self._shade, part, shadows=True)
-        shaded = np.asarray(shaded, dtype=np.float32)
-        left = (shaded.sum(axis=2) + 1.0) / (lit.sum(axis=2) + 1.0)
-        return picture, Image.fromarray((255 * np.minimum(left, 1.0)).astype(np.uint8))
+    def _unshaded(self) -> tuple[Layer, Layer]:
+        """The whole picture in the size that is drawn, and in that of shadows."""
+        whole = (0, 0, *self._size)
+        colour = self._drawn(self._frame, whole)
+        same = self._shade == self._frame
+        return colour, colour if same else self._drawn(self._shade, whole)
 
-    def _shaded(self, picture: Image.Image, left: Image.Image) -> Image.Image:
-        blur = ImageFilter.GaussianBlur(PENUMBRA * left.height)
-        left = left.filter(blur).resize(self._size, Image.Resampling.BILINEAR)
-        return ImageChops.multiply(picture, Image.merge("RGB", (left,) * 3))
+    def _over(self, still: Layer, size: tuple[int, int], part: _Part) -> Image.Image:
+        """Part of a picture of that size, what moves drawn over what stands still."""
+        if any(g.rgba[3] < 1.0 for g in self._moving):  # what is behind shines through
+            return self._drawn(size, part).picture
+        over = self._drawn(size, part, movers=True)
+        x0, y0, x1, y1 = at = _scaled(part, self._size, size)
+        nearer = over.depth < still.depth[y0:y1, x0:x1]
+        picture = still.picture.crop(at)
+        picture.paste(over.picture, (0, 0), Image.fromarray(nearer))
+        return picture
 
-    def _covered(self, view: View) -> tuple[int, int, int, int]:
-        """Pixels around what moves and its shadows, in whole pixels of each layer.
+    def _left(self, part: _Part, lit: Image.Image) -> Image.Image:
+        """The share of light that shadows leave of what is lit there."""
+        shaded = self._drawn(self._shade, part, shadows=True).picture
+        with_, without = (np.asarray(x, dtype=np.float32) for x in (shaded, lit))
+        left = (with_.sum(axis=2) + 1.0) / (without.sum(axis=2) + 1.0)
+        return Image.fromarray((255 * np.minimum(left, 1.0)).astype(np.uint8))
 
-        A shadow lies between what casts it and where its light meets the lowest height.
+    def _soft(self, left: Image.Image, part: _Part) -> Image.Image:
+        """A factor for each colour of a part: shares of light with soft edges."""
+        sigma = PENUMBRA * left.height
+        pad = math.ceil(4 * sigma)
+        x0, y0, x1, y1 = _scaled(part, self._size, left.size)
+        u0, v0 = max(x0 - pad, 0), max(y0 - pad, 0)
+        around = (u0, v0, min(x1 + pad, left.width), min(y1 + pad, left.height))
+        soft = left.crop(around).filter(ImageFilter.GaussianBlur(sigma))
+        size = part[2] - part[0], part[3] - part[1]
+        box = (x0 - u0, y0 - v0, x1 - u0, y1 - v0)
+        soft = soft.resize(size, Image.Resampling.BILINEAR, box=box)
+        return Image.merge("RGB", (soft,) * 3)
+
+    @property
+    def _moving(self) -> Sequence[mujoco.MjvGeom]:
+        return self._movers.geoms[: self._movers.ngeom]
+
+    def _covered(self, view: View) -> tuple[_Part, _Part]:
+        """What moves is in a part of the picture, and with its shadows in another.
+
+        Both are whole pixels of each layer. A shadow lies between what casts it and
+        where its light meets the lowest height.
         """
-        geoms = [self._scene.geoms[i] for i in self._moving]
+        geoms = self._moving
         centre = np.array([g.pos for g in geoms])
         sizes = np.array([g.size for g in geoms])
         radius = np.maximum(
             np.linalg.norm(sizes, axis=1), [g.modelrbound for g in geoms]
         )
         down = np.maximum((self._low - centre[:, 2]) / self._sun[2], 0.0)
-        centre = np.concatenate([centre, centre + down[:, None] * self._sun])
-        radius = np.concatenate([radius, radius / -self._sun[2]])
-        near = (centre - view.lookat) @ view.axes[2] + view.distance - radius
-        if np.any(near < 0.1 * view.distance) or np.any(np.mod(self._size, WHOLE)):
+        shadow = centre + down[:, None] * self._sun
+        near = self._around(centre, radius, view)
+        across = self._around(shadow, radius / -self._sun[2], view)
+        low, high = np.minimum(near, across)[:2], np.maximum(near, across)[2:]
+        return near, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+    def _around(self, centre: np.ndarray, radius: np.ndarray, view: View) -> _Part:
+        """The part of a picture that balls are in; all of it where that is not easy."""
+        whole = self._whole
+        depth = (centre - view.lookat) @ view.axes[2] + view.distance - radius
+        if np.any(depth < 0.1 * view.distance) or np.any(np.mod(self._size, whole)):
             return 0, 0, *self._size
         at = view.project(centre, self._size)
-        span = radius / near * self._size[1] / 2
+        span = radius / depth * self._size[1] / 2
         span = span / math.tan(math.radians(view.fovy) / 2) + SOFT * self._size[1]
-        low = np.floor((at - span[:, None]).min(axis=0) / WHOLE) * WHOLE
-        high = np.ceil((at + span[:, None]).max(axis=0) / WHOLE) * WHOLE
-        low, high = np.clip([low, high], 0, self._size).astype(int)
+        low = np.floor((at - span[:, None]).min(axis=0) / whole) * whole
+        high = np.ceil((at + span[:, None]).max(axis=0) / whole) * whole
+        high = np.maximum(high, low + whole)
+        low = np.clip(low, 0, np.array(self._size) - whole).astype(int)
+        high = np.clip(high, low + whole, self._size).astype(int)
         return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
     def cutout(self, q: np.ndarray, view: View) -> Image.Image:
@@ -281,13 +364,13 @@ class Camera:
         """
         self._update(q, view)
         whole = (0, 0, *self._size)
-        colour = np.asarray(self._drawn(self._frame, whole), dtype=float)
+        colour = np.asarray(self._drawn(self._frame, whole).picture, dtype=float)
         flags = (
             mujoco.mjtRndFlag.mjRND_SEGMENT.value,
             mujoco.mjtRndFlag.mjRND_IDCOLOR.value,
         )
         self._scene.flags[list(flags)] = 1
-        drawn = np.asarray(self._drawn(self._frame, whole))
+        drawn = np.asarray(self._drawn(self._frame, whole).picture)
         there = np.any(drawn > 0, axis=2)[..., None].astype(float)
         self._scene.flags[list(flags)] = 0
         width, height = self._size
@@ -313,32 +396,30 @@ class Camera:
         self._camera.lookat[:] = view.lookat
         self._camera.distance = view.distance
         self._camera.azimuth, self._camera.elevation = view.azimuth, view.elevation
-        scene = self._scene
-        mujoco.mjv_updateScene(
-            self._model,
-            self._data,
-            self._option,
-            None,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            scene,
-        )
         moving = [*shapes, *(c.shape(self._data) for c in self._caps)]
-        own = (mujoco.mjtObj.mjOBJ_GEOM.value, self._robot)
-        drawn = scene.geoms[: scene.ngeom]
-        self._moving = [
-            i for i, g in enumerate(drawn) if g.objtype == own[0] and g.objid in own[1]
-        ]
-        self._moving += range(scene.ngeom, scene.ngeom + len(moving))
-        for shape in (*moving, *still, *self._edges):
-            if scene.ngeom < scene.maxgeom:
+        kinds = mujoco.mjtCatBit
+        for scene, kind, shown in (
+            (self._scene, kinds.mjCAT_ALL, [*moving, *still, *self._edges]),
+            (self._movers, kinds.mjCAT_DYNAMIC, moving),
+        ):
+            mujoco.mjv_updateScene(
+                self._model,
+                self._data,
+                self._option,
+                None,
+                self._camera,
+                kind.value,
+                scene,
+            )
+            for shape in shown[: scene.maxgeom - scene.ngeom]:
                 shape(scene.geoms[scene.ngeom])
                 scene.ngeom += 1
-        self._light(view)
+            self._light(scene, view)
+        self._movers.flags[mujoco.mjtRndFlag.mjRND_SKYBOX.value] = 0
 
-    def _light(self, view: View) -> None:
+    def _light(self, scene: mujoco.MjvScene, view: View) -> None:
         """The sun over the left shoulder, a fill from the right; fog at the horizon."""
-        scene, context, size = self._scene, self._context, view.distance
+        size = view.distance
         right, _, forward = view.axes
         ahead = forward * [1.0, 1.0, 0.0]
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
@@ -359,34 +440,54 @@ class Camera:
             # In the shadow of a light there is not even its ambient part.
             light.ambient[:] = 0.0 if strength is SUN else AMBIENT
             light.specular[:] = 0.25 if strength is SUN else 0.0
-        context.shadowClip = SHADED * size
-        context.fogStart, context.fogEnd = FOG[0] * size, FOG[1] * size
+        for context in self._contexts:
+            context.shadowClip = SHADED * size
+            context.fogStart, context.fogEnd = FOG[0] * size, FOG[1] * size
         scene.flags[mujoco.mjtRndFlag.mjRND_FOG.value] = 1
 
     def _drawn(
-        self, size: tuple[int, int], part: Sequence[int], *, shadows: bool = False
-    ) -> Image.Image:
+        self,
+        size: tuple[int, int],
+        part: _Part,
+        *,
+        movers: bool = False,
+        shadows: bool = False,
+    ) -> Layer:
         """The scene as it was last updated, a part of a picture of that size.
 
         Args:
             size: Width and height of all of it.
-            part: Left, top, right and bottom in pixels of `shot`.
+            part: In pixels of `shot`.
+            movers: What moves alone.
             shadows: With them.
         """
-        scale = np.array(size) / self._size
-        x0, y0, x1, y1 = (np.array(part) * np.tile(scale, 2)).round().astype(int)
+        scene = self._movers if movers else self._scene
+        x0, y0, x1, y1 = _scaled(part, self._size, size)
         half = math.tan(math.radians(self._fovy) / 2)  # of the height, at unit depth
-        for camera in self._scene.camera:
+        for camera in scene.camera:
             unit = half * camera.frustum_near * 2 / size[1]  # of a pixel
             camera.frustum_center = unit * ((x0 + x1) - size[0]) / 2
             camera.frustum_top = unit * (size[1] / 2 - y0)
             camera.frustum_bottom = unit * (size[1] / 2 - y1)
-        rect = mujoco.MjrRect(0, 0, int(x1 - x0), int(y1 - y0))
+        rect = mujoco.MjrRect(0, 0, x1 - x0, y1 - y0)
         pixels = np.empty((rect.height, rect.width, 3), dtype=np.uint8)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = int(shadows)
-        mujoco.mjr_render(rect, self._scene, self._context)
-        mujoco.mjr_readPixels(pixels, None, rect, self._context)
-        return Image.fromarray(pixels[::-1])
+        depth = np.empty((rect.height, rect.width), dtype=np.float32)
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = int(shadows)
+        context = self._contexts[-1 if size == self._shade else 0]
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+        mujoco.mjr_render(rect, scene, context)
+        mujoco.mjr_readPixels(pixels, depth, rect, context)
+        return Layer(picture=Image.fromarray(pixels[::-1]), depth=depth[::-1])
+
+
+def _scaled(part: _Part, seen: tuple[int, int], size: tuple[int, int]) -> _Part:
+    """A part of what is seen, in pixels of a picture of another size."""
+    x0, y0, x1, y1 = (round(part[i] * size[i % 2] / seen[i % 2]) for i in range(4))
+    return x0, y0, x1, y1
+
+
+def _context(model: mujoco.MjModel) -> mujoco.MjrContext:
+    return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
 
 
 def _lowest(model: mujoco.MjModel) -> float:
@@ -488,14 +589,19 @@ class _Cap:
         return bar(mujoco.mjtGeom.mjGEOM_CYLINDER, ends, self.radius, self.colour)
 
 
+def _has_meshes(model: mujoco.MjModel, world: World) -> bool:
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+    return bool(np.any(own & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)))
+
+
 def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
     """Axles of the hinges that lie in a ball or a capsule of their link.
 
     A robot drawn with meshes has its own.
     """
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
-    if np.any(own & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)):
+    if _has_meshes(model, world):
         return []
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
     round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
     round_ones = own & np.isin(model.geom_type, [k.value for k in round_ones])
     caps = []

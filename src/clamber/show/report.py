@@ -21,7 +21,7 @@ import io as bytes_io
 import json
 import math
 import string
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -35,6 +35,7 @@ from clamber.errors import InputError
 from clamber.execution.simulation import Rollout
 from clamber.model.arguments import checks_types
 from clamber.model.kinematics import Kinematics
+from clamber.model.progress import Progress, silent
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.run.codec import whole_file
@@ -51,6 +52,7 @@ from clamber.show.sample import (
 
 REPORT = "report.html"
 PERSON = "demonstration.png"  # of the recording, which is not in the folder
+READING = 0.4  # of the time that a report takes
 MAX_PICTURE = 1_000_000  # [bytes] larger ones are left out
 MAX_POSES = (
     1_200_000  # [bytes] of one run's poses; longer runs are sampled more coarsely
@@ -77,6 +79,7 @@ def write_report(
     *,
     compare: str | Path | None = None,
     out: str | Path | None = None,
+    progress: Progress | None = None,
 ) -> Reported:
     """Write the report of a run as one HTML file.
 
@@ -84,13 +87,21 @@ def write_report(
         folder: A run folder, whole or not.
         compare: Another one, laid beside it.
         out: The file; `report.html` in the run folder by default.
+        progress: Called with stage, share and note.
 
     Raises:
         InputError: There is nothing to show in a folder, or the file cannot be written.
     """
     folder = Path(folder)
     runs = [folder] if compare is None else [folder, Path(compare)]
-    shown = [run_record(f) for f in runs]
+    tell = progress or silent
+    shown = []
+    for k, run in enumerate(runs):
+
+        def of_all(done: float, note: str, k: int = k) -> None:
+            tell("report", (k + done) / len(runs), note)
+
+        shown.append(run_record(run, of_all))
     file = folder / REPORT if out is None else Path(out)
     try:
         with whole_file(file) as draft:
@@ -153,12 +164,19 @@ def _finite(x: Any) -> Any:
 # What a folder holds.
 
 
-def run_record(folder: Path) -> dict[str, Any]:
+def run_record(
+    folder: Path, tell: Callable[[float, str], None] = lambda done, note: None
+) -> dict[str, Any]:
     """All that the page shows of a run, as plain values.
+
+    Args:
+        folder: The run's.
+        tell: Called with the share done and a note.
 
     Raises:
         InputError: It is no folder, or nothing in it can be read.
     """
+    tell(0.0, f"reading {folder}")
     run = read_run(folder)
     written, plan, rollout = run.written, run.plan, run.rollout
     picture = run.attempt(lambda: _picture(folder / PERSON))
@@ -170,7 +188,13 @@ def run_record(folder: Path) -> dict[str, Any]:
     motion = None
     times: list[float | None] = [None] * len(written.get("keyframes", []))
     if plan is not None:
-        motion = _motion(plan, rollout, run.execution)
+        tell(READING, "stability")
+        motion = _motion(
+            plan,
+            rollout,
+            run.execution,
+            lambda done: tell(READING + (1.0 - READING) * done, "stability"),
+        )
         times = keyframe_times(plan, rollout)
     name = written.get("robot", {}).get("name")
     place = folder.resolve().name
@@ -240,13 +264,16 @@ def _picture(path: Path) -> str | None:
 
 
 def _motion(
-    plan: Plan, rollout: Rollout | None, execution: Mapping[str, Any]
+    plan: Plan,
+    rollout: Rollout | None,
+    execution: Mapping[str, Any],
+    tell: Callable[[float], None],
 ) -> dict[str, Any]:
     """What is animated and plotted of a run."""
     world = plan.world if rollout is None else rollout.world
     meshes = body_meshes(world.model)
     most = max(2, MAX_POSES // (28 * max(len(meshes), 1)))
-    m = sample_motion(plan, rollout, execution, most)
+    m = sample_motion(plan, rollout, execution, most, tell)
     series: dict[str, np.ndarray | None] = {
         "loaded": m.loaded,
         "force": m.force,

@@ -357,6 +357,7 @@ def sample_motion(
     rollout: Rollout | None,
     execution: Mapping[str, Any],
     most: int | None = None,
+    tell: Callable[[float], None] = lambda done: None,
 ) -> Motion:
     """Sample a run at 25 Hz.
 
@@ -365,6 +366,7 @@ def sample_motion(
         rollout: What physics made of it, or None.
         execution: Fields of `execution.json`, or none.
         most: Samples at most.
+        tell: Called with the share done.
     """
     world = plan.world if rollout is None else rollout.world
     reference = plan.trajectory
@@ -390,10 +392,13 @@ def sample_motion(
     planned, bears = series["planned"], series.get("loaded")
     bears = planned if bears is None else bears
     marked = bears if planned is None else bears | planned
-    series |= stability_of(world, q, marked, bears)
     q_ref = series.get("reference")
+    twice = q_ref is not None and planned is not None
+    series |= stability_of(world, q, marked, bears, lambda x: tell(x / (1 + twice)))
     if q_ref is not None and planned is not None:
-        planned_ones = stability_of(world, q_ref, planned, planned)
+        planned_ones = stability_of(
+            world, q_ref, planned, planned, lambda x: tell((1 + x) / 2)
+        )
         series["planned_margin"] = planned_ones["margin"]
         series["error"] = _errors(world, q, q_ref)
     end = float(time[-1])
@@ -465,7 +470,11 @@ def peaks(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def stability_of(
-    world: World, postures: np.ndarray, marked: np.ndarray, bears: np.ndarray
+    world: World,
+    postures: np.ndarray,
+    marked: np.ndarray,
+    bears: np.ndarray,
+    tell: Callable[[float], None] = lambda done: None,
 ) -> dict[str, np.ndarray]:
     """Geometric stability (4.17) of postures (n, nq): fields of a `Motion`.
 
@@ -474,6 +483,7 @@ def stability_of(
         postures: (n, nq).
         marked: (n, nS) bool, surfaces of which the distances are wanted.
         bears: (n, nS) bool, surfaces on which the centre of mass is held.
+        tell: Called with the share done.
     """
     kin, supports = Kinematics(world), list(world.supports)
     n, count = marked.shape
@@ -481,6 +491,8 @@ def stability_of(
     d, limit = np.full((n, count), np.nan), np.full((n, count), np.nan)
     margin = np.full(n, np.nan)
     for i, q in enumerate(postures):
+        if i % 100 == 0:
+            tell(i / n)
         kin.update(q)
         bearing = []
         for j, surface in enumerate(world.surfaces):
@@ -510,13 +522,14 @@ def bearing_of(kin: Kinematics, surface: str, support: Support) -> np.ndarray:
 
 def support_below(world: World, kin: Kinematics, surface: str) -> Support:
     """The support that a surface is nearest to at the present posture."""
-
-    def gap(s: Support) -> float:
+    found = []
+    for k, s in enumerate(world.supports.values()):
         point = kin.contact_point(surface, s.normal)
-        outside = 0.0 if s.inside(point, -0.05) else math.inf
-        return abs(float(s.height(point))) + outside
-
-    return min(world.supports.values(), key=gap)
+        found.append((abs(float(s.height(point))), k, s, point))
+    for _, _, s, point in sorted(found):
+        if s.inside(point, -0.05):
+            return s
+    return found[0][2]
 
 
 def posture_at(motion: Motion, q: np.ndarray, t: float) -> np.ndarray:

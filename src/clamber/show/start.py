@@ -279,7 +279,7 @@ def known_robots() -> dict[str, str]:
     return (
         {name: name for name in built_in}
         | {str(p.parent): str(p) for p in own}
-        | {f"{name} (of a wheel)": name for name in carried}
+        | {f"{name} (from a package)": name for name in carried}
     )
 
 
