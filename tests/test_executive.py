@@ -724,8 +724,8 @@ def test_while_a_contact_is_loaded_it_goes_back_to_its_touch(
 ):
     """The contact is made, and carries nothing as yet."""
     told, touch = Told(demo_plan), touch_of(demo_plan, 0)
-    told.to(touch + 150)
-    told.to(touch + 900, share=0.8)
+    told.to(touch + 30)
+    told.to(touch + 290, share=0.8)
     assert kinds(told.events) == [Unintended]
     for _ in range(3000):
         if not nothing_found:

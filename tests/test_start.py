@@ -279,7 +279,7 @@ def test_a_contact_that_does_not_bear_yet_is_loaded_little_by_little(demo_plan):
     assert np.abs(tau - before).max() > 0.1
     away = [np.abs(t.tau[settled] - x).max() for x in (tau, before)]
     assert away[0] < away[1]
-    assert np.abs(np.diff(t.tau[: settled + 1], axis=0)).max() < 2.0  # no jump
+    assert np.abs(np.diff(t.tau[: settled + 1], axis=0)).max() < 4.0  # no jump
     # The contact is closed all the while.
     assert t.contact[: settled + 1, t.surfaces.index("RHand")].all()
 

@@ -70,7 +70,7 @@ LOOK = 0.15  # [s] at rest before a posture is measured
 THINKING = 0.1  # [s] the robot stands still while the rest is planned again
 SEARCHING = 1.0  # [s] ... where other contacts are looked for
 PAUSE = 10.0  # [s] that it stands where it is told to pause
-FEEL = 0.01  # [s] later than planned that a contact may be felt
+FEEL = 0.05  # [s] later than planned that a contact may be felt
 HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
 FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
@@ -307,7 +307,10 @@ class Executive:
 
         self.estimate.expect(c, force=PRESSED)
         yield from ref.play(late, until=is_there)
-        yield from ref.stop(until=is_there)
+        # Where nothing at all is felt, torques that count on it would throw the robot.
+        missing = self.estimate.force(c) < LOST
+        push = min(ref.i, span.touch) if missing else None
+        yield from ref.stop(until=is_there, push=push)
         self.estimate.expect()
         if is_there():
             return False

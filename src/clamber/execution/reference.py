@@ -113,10 +113,14 @@ class Reference:
                     yield from self._stand(to)
                 yield
 
-    def stop(self, until: Callable[[], bool] | None = None) -> Actions:
+    def stop(
+        self, until: Callable[[], bool] | None = None, push: int | None = None
+    ) -> Actions:
         """Slow down along the trajectory, to rest before a limb leaves.
 
-        Or until something happens: then it can go on without having stopped.
+        Args:
+            until: Something happens: then it can go on without having stopped.
+            push: Sample whose torques are fed forward; None: of each.
         """
         if not self.moves or (until is not None and until()):
             return
@@ -125,7 +129,7 @@ class Reference:
         by = min(next(leaves, len(t.time)) - 1, i + round(0.5 * RAMP / PHYSICS_STEP))
         self.left_plan = True
         if by > i:
-            self._load_at(by, down=True)
+            self._load_at(by, down=True, push=push)
             for _ in self._done():
                 yield
                 if until is not None and until():
