@@ -82,12 +82,17 @@ def test_the_robot_is_there_at_rest_at_every_time(view: Opened):
 
 def test_the_robot_never_vanishes_while_it_plays(view: Opened):
     clock = view.page.clock
+    usual, clock.speed = clock.speed, 0.25  # a picture takes seconds on a busy machine
     view.click("play")
     view.until(lambda: clock.playing)
     times, counts = [], []
-    while clock.playing:
+    while clock.playing and len(counts) < 20:
         counts.append(view.orange())
         times.append(clock.t)
+    clock.speed = usual
+    if clock.playing:
+        view.click("play")
+        view.until(lambda: not clock.playing)
     assert len(counts) > 2
     assert min(counts) > ENOUGH, dict(zip(times, counts, strict=True))
     assert times[-1] > times[0]

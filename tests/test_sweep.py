@@ -183,7 +183,12 @@ def test_a_killed_sweep_goes_on_and_does_no_finished_run_again(
 
 
 def test_the_workers_of_a_killed_sweep_end_too(under_way: subprocess.Popen, log: Path):
-    workers = {int(f.name.split("-")[1]) for f in log.iterdir()}
+    def seen() -> set[int]:
+        return {int(f.name.split("-")[1]) for f in log.iterdir()}
+
+    # One may have started late.
+    wait_until(lambda: len(seen()) == 2 or under_way.poll() is not None)
+    workers = seen()
     assert len(workers) == 2
     under_way.send_signal(signal.SIGKILL)
     under_way.wait()
