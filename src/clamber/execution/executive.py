@@ -309,8 +309,7 @@ class Executive:
         yield from ref.play(late, until=is_there)
         # Where nothing at all is felt, torques that count on it would throw the robot.
         missing = self.estimate.force(c) < LOST
-        push = min(ref.i, span.touch) if missing else None
-        yield from ref.stop(until=is_there, push=push)
+        yield from ref.stop(until=is_there, push=span.touch if missing else None)
         self.estimate.expect()
         if is_there():
             return False

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from clamber.model.arguments import checks_types
 from clamber.model.propose import Proposal, robot_yaml
+from clamber.model.robot import ROBOT_FILE
 from clamber.model.shapes import MESH_FOLDER
 from clamber.run.codec import whole_file
 
@@ -20,7 +21,7 @@ def save_proposal(proposal: Proposal, folder: str | Path) -> None:
     """
     files = {f"{MESH_FOLDER}/{n}": content for n, content in proposal.files.items()}
     files[proposal.fields["model"]] = proposal.mjcf.encode()
-    files["robot.yaml"] = robot_yaml(proposal).encode()
+    files[ROBOT_FILE] = robot_yaml(proposal).encode()
     for name, content in files.items():
         path = Path(folder) / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -241,12 +241,8 @@ class Camera:
                 and what they put in shadow, in a fraction of the time.
         """
         self._update(q, view, shapes, () if still is None else still.shapes)
-        whole = (0, 0, *self._size)
         if still is None:
-            colour, lit = self._unshaded()
-            left = self._left(whole, lit.picture)
-            plain = colour.picture.resize(self._size, Image.Resampling.BOX)
-            return ImageChops.multiply(plain, self._soft(left, whole))
+            return self._entire().picture
         near, around = self._covered(view)
         plain = still.plain.copy()
         piece = self._over(still.colour, self._frame, near)
@@ -266,8 +262,14 @@ class Camera:
         q = self._model.qpos0.copy()
         q[:3] = view.lookat + FAR_AWAY * view.axes[0]
         self._update(q, view, (), shapes)
+        return self._entire(shapes)
+
+    def _entire(self, shapes: Sequence[Shape] = ()) -> Still:
+        """The scene as it was last updated; `shapes` of it stand still."""
         whole = (0, 0, *self._size)
-        colour, lit = self._unshaded()
+        colour = lit = self._drawn(self._frame, whole)
+        if self._shade != self._frame:
+            lit = self._drawn(self._shade, whole)
         left = self._left(whole, lit.picture)
         plain = colour.picture.resize(self._size, Image.Resampling.BOX)
         return Still(
@@ -278,13 +280,6 @@ class Camera:
             left=left,
             picture=ImageChops.multiply(plain, self._soft(left, whole)),
         )
-
-    def _unshaded(self) -> tuple[Layer, Layer]:
-        """The whole picture in the size that is drawn, and in that of shadows."""
-        whole = (0, 0, *self._size)
-        colour = self._drawn(self._frame, whole)
-        same = self._shade == self._frame
-        return colour, colour if same else self._drawn(self._shade, whole)
 
     def _over(self, still: Layer, size: tuple[int, int], part: _Part) -> Image.Image:
         """Part of a picture of that size, what moves drawn over what stands still."""
@@ -589,9 +584,14 @@ class _Cap:
         return bar(mujoco.mjtGeom.mjGEOM_CYLINDER, ends, self.radius, self.colour)
 
 
+def _own(model: mujoco.MjModel, world: World) -> np.ndarray:
+    """(ngeom,) bool: the robot's."""
+    return model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+
+
 def _has_meshes(model: mujoco.MjModel, world: World) -> bool:
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
-    return bool(np.any(own & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)))
+    meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    return bool(np.any(_own(model, world) & meshes))
 
 
 def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
@@ -601,9 +601,10 @@ def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
     """
     if _has_meshes(model, world):
         return []
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
     round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
-    round_ones = own & np.isin(model.geom_type, [k.value for k in round_ones])
+    round_ones = _own(model, world) & np.isin(
+        model.geom_type, [k.value for k in round_ones]
+    )
     caps = []
     for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE):
         body, at, axis = int(model.jnt_bodyid[j]), model.jnt_pos[j], model.jnt_axis[j]
