@@ -193,6 +193,21 @@ def test_the_robot_is_there_in_every_size_and_theme(
         assert wide <= size["width"]
 
 
+def test_a_screen_that_turns_upright_still_has_the_whole_robot(
+    browser: Any, whole: Path
+):
+    with served(browser, whole, size=SIZES["desktop"][0]) as view:
+        view.until(lambda: view.orange() > ENOUGH)
+        size, clip = SIZES["phone"]
+        view.tab.set_viewport_size(size)
+
+        def whole_robot() -> bool:
+            seen = orange_in(view.picture({**clip, "height": 310}))
+            return np.sum(seen) > ENOUGH and not seen[-2:].any()
+
+        view.until(whole_robot, "all of the robot")
+
+
 def test_every_frame_that_is_drawn_while_it_plays_has_the_robot_in_it(view: Opened):
     """Frames as the browser has drawn them: not those that a screenshot waits for."""
     frames: list[bytes] = []

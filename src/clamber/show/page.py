@@ -313,9 +313,19 @@ class Page:
             self._sun.cast_shadow = shadows.value
 
     def _welcome(self, client: Any) -> None:
-        """A phone's camera is not that of a screen."""
-        if client.camera.aspect < UPRIGHT:
-            self.aim(client)
+        """A phone's camera is not that of a screen, whenever it turns out to be one.
+
+        A browser tells its size before it has laid out the page, and may set the usual
+        camera after ours.
+        """
+
+        def usual(camera: Any) -> None:
+            first = self.server.initial_camera.position
+            if camera.aspect < UPRIGHT and np.allclose(camera.position, first, atol=1e-3):
+                self.aim(client)
+
+        client.camera.on_update(usual)
+        usual(client.camera)
 
     def _carry(self, t: float) -> None:
         """Move the cameras along with the robot."""
