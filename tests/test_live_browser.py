@@ -196,8 +196,8 @@ def test_the_robot_is_there_in_every_size_and_theme(
 def test_a_screen_that_turns_upright_still_has_the_whole_robot(
     browser: Any, whole: Path
 ):
-    with served(browser, whole, size=SIZES["desktop"][0]) as view:
-        view.until(lambda: view.orange() > ENOUGH)
+    with served(browser, whole) as view:
+        view.until(lambda: view.orange() > ENOUGH, "the robot")
         size, clip = SIZES["phone"]
         view.tab.set_viewport_size(size)
 

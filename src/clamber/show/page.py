@@ -313,19 +313,27 @@ class Page:
             self._sun.cast_shadow = shadows.value
 
     def _welcome(self, client: Any) -> None:
-        """A phone's camera is not that of a screen, whenever it turns out to be one.
+        """A phone's camera is not that of a screen, nor that of a phone on its side.
 
         A browser tells its size before it has laid out the page, and may set the usual
-        camera after ours.
+        camera after ours. One that a person has moved is left alone.
         """
+        first = self.server.initial_camera
+        where, aspect = np.full(3, np.nan), 0.0  # where we put it, and for which screen
 
-        def usual(camera: Any) -> None:
-            first = self.server.initial_camera.position
-            if camera.aspect < UPRIGHT and np.allclose(camera.position, first, atol=1e-3):
+        def fit(camera: Any) -> None:
+            nonlocal where, aspect
+            usual, ours = (
+                np.allclose(camera.position, p, atol=1e-3)
+                for p in (first.position, where)
+            )
+            upright = camera.aspect < UPRIGHT
+            if (upright and usual) or (ours and camera.aspect != aspect):
                 self.aim(client)
+                where, aspect = client.camera.position, camera.aspect
 
-        client.camera.on_update(usual)
-        usual(client.camera)
+        client.camera.on_update(fit)
+        fit(client.camera)
 
     def _carry(self, t: float) -> None:
         """Move the cameras along with the robot."""
