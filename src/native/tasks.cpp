@@ -128,10 +128,12 @@ void Rows::at_most(double room, const Vec3& com) {
     add(kept, -FAR, room, com);
 }
 
-void Rows::inside(int support, const Vec3& p, int body, const Vec3& moves) {
+void Rows::inside(int support, const Vec3& p, int body, const Vec3& moves, const Vec3* at) {
     const Support& s = model_.supports[support];
     for (std::size_t i = 0; i < s.A.size(); ++i) {
-        const double room = s.b[i] - EDGE_INSET - dot(s.A[i], p);
+        double border = s.b[i] - EDGE_INSET;
+        if (at != nullptr) border = std::max(border, dot(s.A[i], *at));
+        const double room = border - dot(s.A[i], p);
         if (!(room < EDGE_RANGE)) continue;
         at_most(room);
         pull(body, moves, s.A[i]);
@@ -168,7 +170,9 @@ void Rows::contact(const Kinematics& kin, const SurfaceTask& task) {
                 close(turn[k]);
                 push(s.body, {}, UNIT[k]);
             }
-            if (!s.flat && task.has_link) inside(task.support, p, s.body, centre);
+            // One that lies near the border, as it slipped there, has no need to roll back.
+            if (!s.flat && task.has_link)
+                inside(task.support, p, s.body, centre, &task.position);
             break;
         }
         case TaskKind::OnEdge: {

@@ -116,7 +116,9 @@ class Rows {
     void want(double e, double weight, const Vec3& com = {});
     void close(double e);
     void at_most(double room, const Vec3& com = {});
-    void inside(int support, const Vec3& p, int body, const Vec3& moves);
+    // A point stays inside the border of its support, or no farther out than `at`.
+    void inside(int support, const Vec3& p, int body, const Vec3& moves,
+                const Vec3* at = nullptr);
     void contact(const Kinematics& kin, const SurfaceTask& task);
     void point(const Kinematics& kin, const PointingTask& task);
     void balance(Kinematics& kin, const Problem& problem);

@@ -32,6 +32,7 @@ POSE_SMOOTHING = 0.01  # [s] ... and of the measured posture: it must not lag a 
 TILTED = 0.35  # [rad] a sole that is more so touches with a corner
 NEAR = 0.06  # [m] sideways from the planned place, a touch is that contact
 DEVIATION = 0.006  # [m] along the normal: a contact is not where it was planned
+YIELDS = 0.005  # [m] a contact that bears lies so far beside where its joints aim
 
 
 class Estimate:
@@ -141,6 +142,21 @@ class Estimate:
         """The contact where it is."""
         self.kin.update(self.q)
         return measured_contact(self.kin, c)
+
+    def aimed(self, c: Contact, q: np.ndarray) -> Contact:
+        """The contact where it is, but for what it yields to its load.
+
+        Of limbs that are nearly straight, closing millimetres takes a large motion.
+
+        Args:
+            c: The contact.
+            q: (nq,) measured base, and what the joints are commanded to.
+        """
+        measured = self.measured(c)
+        self.kin.update(q)
+        off = measured_contact(self.kin, c).position - measured.position
+        off *= min(1.0, YIELDS / max(float(np.linalg.norm(off)), 1e-9))
+        return replace(measured, position=measured.position + off)
 
     def remember(self, contacts: Sequence[Contact], done: int) -> None:
         """Keep where supports were measured, one place for each contact made.

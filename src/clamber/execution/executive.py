@@ -517,13 +517,13 @@ class Executive:
         off = max(max(abs(u), s) for u, s in map(estimate.deviation, contacts))
         if len(contacts) < len(self.stance):
             off = np.inf  # without a contact there is no going on as planned
-        measured = {c: estimate.measured(c) for c in contacts}
-        estimate.remember(list(measured.values()), self.done)
+        estimate.remember([estimate.measured(c) for c in contacts], self.done)
         q = self.reference.copy()  # joints as commanded, base as measured
         q[:7] = estimate.q[:7]
+        aimed = {c: estimate.aimed(c, q) for c in contacts}
         now = State(
-            stance=tuple(measured.values()),
-            loaded=tuple(x for c, x in measured.items() if c in loaded),
+            stance=tuple(aimed.values()),
+            loaded=tuple(x for c, x in aimed.items() if c in loaded),
             q=q,
             done=self.done,
         )
