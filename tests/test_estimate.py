@@ -16,6 +16,7 @@ from clamber.execution.estimate import (
     NEAR,
     PRESSED,
     TOUCH,
+    YIELDS,
     Estimate,
 )
 from clamber.execution.probe import REACH
@@ -184,6 +185,16 @@ def test_a_measured_contact_is_where_the_surface_is(estimate, hands_plan):
     assert np.allclose(found.position, kin.contact_point("LHand", UP), atol=1e-12)
     assert estimate.deviation(found) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert (found.surface, found.support, found.edge) == ("LHand", "box", None)
+
+
+@pytest.mark.parametrize("off", [0.003, 0.02])
+def test_a_contact_yields_to_its_load_by_millimetres(estimate, hands_plan, off):
+    """It is taken where the joints aim, as far as a load explains the difference."""
+    c = placed(estimate, hands_plan, 1)
+    q = estimate.q.copy()
+    q[:3] += [0.0, off, 0.0]
+    way = estimate.aimed(c, q).position - estimate.measured(c).position
+    assert np.allclose(way, [0.0, min(off, YIELDS), 0.0], atol=1e-9)
 
 
 def test_a_measured_foot_lies_on_the_ground_as_it_is_turned(estimate, hands_plan):

@@ -350,14 +350,15 @@ def test_durations_are_in_one_file_alone(plan: Plan, copied: Path):
 def test_results_of_an_earlier_plan_do_not_stay(
     plan: Plan, rollout: Rollout, tmp_path: Path
 ):
-    save_plan(plan, tmp_path)
-    save_rollout(plan, rollout, tmp_path)
-    save_verdict(Verdict(reached=True, criteria={}), tmp_path)
+    run = tmp_path / "runs" / "climb"  # which it makes
+    save_plan(plan, run)
+    save_rollout(plan, rollout, run)
+    save_verdict(Verdict(reached=True, criteria={}), run)
     nothing = replace(plan, trajectory=None, complete=False)
-    save_plan(nothing, tmp_path)
-    left = {p.name for p in tmp_path.iterdir()}
+    save_plan(nothing, run)
+    left = {p.name for p in run.iterdir()}
     assert left == {PLAN, PLANNED_SCENE, SCENE, TIMINGS}
-    assert same(load_plan(tmp_path), nothing)
+    assert same(load_plan(run), nothing)
 
 
 def test_what_a_solver_could_not_say_survives_as_null(plan: Plan, tmp_path: Path):

@@ -23,7 +23,13 @@ from clamber.planning import planner, start
 from clamber.planning.planner import plan
 from clamber.planning.records import Budget, Fallback, State
 from clamber.planning.search import Search
-from clamber.planning.start import from_here, settle, state_of, steps_done
+from clamber.planning.start import (
+    from_here,
+    measured_contact,
+    settle,
+    state_of,
+    steps_done,
+)
 from clamber.planning.trajectory import HOLD_START, RATE, holding_torque
 from clamber.run.folder import load_plan, save_plan
 from clamber.run.state import load_state
@@ -295,6 +301,22 @@ def test_with_no_steps_left_there_is_still_the_way_to_a_good_posture(fast_plan):
     assert described(found.start.stance) == described(contacts)
     end = Kinematics(found.world).difference(found.trajectory.q[-1], found.start.q)
     assert np.abs(end).max() < 1e-6
+
+
+def test_a_contact_that_slipped_to_the_border_need_not_roll_back(demo_plan):
+    """Rolling a hand inwards by two centimetres would take all of the body along."""
+    key, world = demo_plan.keyframes[2], demo_plan.world
+    hand = max(c.position[0] for c in key.stance if c.support == "box")
+    box = world.scene.boxes[0]
+    near = float(box.centre[0] - box.size[0] / 2)
+    there = build_world(world.robot, moved(world.scene, hand + 0.005 - near, 0.0, 0.0))
+    kin = Kinematics(there)
+    kin.update(key.q)
+    contacts = tuple(measured_contact(kin, c) for c in key.stance)
+    now = State(stance=contacts, loaded=contacts, q=key.q, done=2)
+    _, lead = settle(IK(there), now, demo_plan.options)
+    begin, here = lead[0].q
+    assert np.abs(kin.difference(begin, here)).max() < 5e-3
 
 
 @pytest.mark.parametrize("open_way", [True, False])

@@ -209,9 +209,10 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
 
     Args:
         plan: Complete or not.
-        folder: That exists, see `new_run_folder`.
+        folder: Made where there is none.
     """
     folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     for name in (*_OF_A_PLAN, *_OF_A_RUN):
         (folder / name).unlink(missing_ok=True)
     for name in (PLANNED_SCENE, SCENE):
