@@ -95,6 +95,20 @@ def contact_forces(
 ) -> tuple[np.ndarray, float]:
     """The least forces (nc, 3) [N], and what they leave unbalanced [weights]."""
 
+def com_room(
+    points: np.ndarray,
+    normals: np.ndarray,
+    mu: np.ndarray,
+    edges: int,
+    com: np.ndarray,
+    mass: float,
+    torque: _Torque,
+) -> float:
+    """How far the centre of mass may lie elsewhere [m], in the worst direction.
+
+    Negative: how far it has to, -1 where no place would do.
+    """
+
 def push_margin(
     points: np.ndarray,
     normals: np.ndarray,

@@ -173,8 +173,8 @@ double Statics::contact_forces(const ContactPointsView& contacts, const LoadView
     return std::sqrt(left);
 }
 
-double Statics::push_margin(const ContactPointsView& contacts, const LoadView& load,
-                            const TorqueView& torque, double* yields) {
+double Statics::least_room(const ContactPointsView& contacts, const LoadView& load,
+                           const TorqueView& torque, bool moves, double* yields) {
     const int edges = contacts.cone_edges, n = contacts.n * edges, na = torque.na;
     const int rows = 6 + na;
     std::fill(yields, yields + contacts.n + na, 0.0);
@@ -197,7 +197,12 @@ double Statics::push_margin(const ContactPointsView& contacts, const LoadView& l
         lower_.assign(m, 0.0);
         sense_.assign(m, INEQUALITY);
         for (int i = 0; i < pushes; ++i) {
-            A[i * nv + n + i] = 1.0;
+            // A push is one more force. A weight that lies at (x, y) from the centre of
+            // mass has the moment (-y, x) about it, which the contacts have to make good.
+            if (moves)
+                A[(i == 0 ? 4 : 3) * nv + n + i] = i == 0 ? 1.0 : -1.0;
+            else
+                A[i * nv + n + i] = 1.0;
             upper_[n + i] = PUSH_LIMIT;
             lower_[n + i] = -PUSH_LIMIT;
         }
@@ -394,6 +399,14 @@ void bind_statics(nb::module_& m) {
                                                  yields.data());
               }
               return nb::make_tuple(margin, new_array(yields.data(), {yields.size()}));
+          });
+    m.def("com_room",
+          [](const Points& points, const Points& normals, const Array1<>& mu, int edges,
+             const Vector& com, double mass, const Torque& torque) {
+              const ContactPointsView contacts = contacts_of(points, normals, mu, edges);
+              const TorqueView view = torque_of(torque, contacts.n);
+              const nb::gil_scoped_release released;
+              return Statics().com_room(contacts, load_of(com, mass), view);
           });
     m.def("is_statically_stable", [](const Points& points, const Points& normals,
                                      const Array1<>& mu, int edges, const Vector& com) {

@@ -68,12 +68,25 @@ public:
     // most 1; negative: the least without which it falls, -1 where none helps. `yields`
     // (n + na): how fast points and joints give way to the weakest push.
     double push_margin(const ContactPointsView& contacts, const LoadView& load,
-                       const TorqueView& torque, double* yields);
+                       const TorqueView& torque, double* yields) {
+        return least_room(contacts, load, torque, false, yields);
+    }
+
+    // How far the centre of mass may lie elsewhere [m], horizontally, in every direction;
+    // negative: how far it has to, -1 where no place would do.
+    double com_room(const ContactPointsView& contacts, const LoadView& load,
+                    const TorqueView& torque) {
+        std::vector<double> yields(contacts.n + torque.na);
+        return least_room(contacts, load, torque, true, yields.data());
+    }
 
     // Whether forces within the friction cones balance gravity.
     bool is_stable(const ContactPointsView& contacts, const double* com);
 
 private:
+    // The largest push [weights], or displacement of the weight [m], in the worst direction.
+    double least_room(const ContactPointsView& contacts, const LoadView& load,
+                      const TorqueView& torque, bool moves, double* yields);
     static double* zeroed(std::vector<double>& buffer, std::size_t size) {
         buffer.assign(size, 0.0);
         return buffer.data();

@@ -158,12 +158,19 @@ class PlanningFlags:
         "planning.records", "PlanOptions", "speed"
     )
     """Largest joint speed; max: as fast as joints and contacts bear."""
+    robust: Switch = False
+    """Keep a margin for a mass, friction, CoM and contacts that are a little off."""
     budget: Annotated[float | None, shown("SECONDS", "no bound")] = None
     """For all planning; with a bound, what is found depends on the machine."""
 
     def options(self, **more: Any) -> clamber.PlanOptions:
         """With other options of planning."""
-        return clamber.PlanOptions(method=self.method, speed=self.speed, **more)
+        return clamber.PlanOptions(
+            method=self.method,
+            speed=self.speed,
+            robust=self.robust,
+            **more,
+        )
 
     def bound(self, **more: Any) -> clamber.Budget:
         """The budget, with other bounds."""

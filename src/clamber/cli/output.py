@@ -168,9 +168,14 @@ def new_table(*columns: str, numbers: bool = False) -> Table:
 
 def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any]:
     """What `--json` says of a plan; costs and margins are those of `plan.json`."""
-    moves = [None, *(c.step for c in plan.changes)]
-    keyframes = []
-    for move, key in zip(moves, plan.keyframes, strict=True):
+    from clamber.model.kinematics import Kinematics
+    from clamber.step.robust import robust_margin, robust_margin_along
+
+    kin, keyframes = Kinematics(plan.world), []
+    changes = [None, *plan.changes]
+    for change, key in zip(changes, plan.keyframes, strict=True):
+        move = None if change is None else change.step
+        phases = () if change is None else change.phases
         keyframes.append(
             {
                 "move": "start" if move is None else str(move),
@@ -183,6 +188,8 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
                     c.contact.surface: c.projected_distance for c in key.contacts
                 },
                 "com_margin": key.com_margin if math.isfinite(key.com_margin) else None,
+                "robust_margin": robust_margin(kin, key.q, key.stance),
+                "robust_margin_on_way": robust_margin_along(kin, phases),
                 "equilibrium_margin": key.equilibrium.margin,
                 "limiting": key.equilibrium.limiting,
             }
@@ -205,12 +212,13 @@ def keyframe_tables(record: Mapping[str, Any]) -> list[Table]:
         "cost",
         "after",
         "CoM [mm]",
+        "robust [mm]",
         "push [m g]",
         "limited by",
     )
     keys = record["keyframes"]
     for k in keys:
-        com = k["com_margin"]
+        com, way = k["com_margin"], k["robust_margin_on_way"]
         found.add_row(
             k["move"],
             str(k["iterations"]),
@@ -218,6 +226,7 @@ def keyframe_tables(record: Mapping[str, Any]) -> list[Table]:
             f"{k['cost_before']:.3f}",
             f"{k['cost_after']:.3f}",
             "-" if com is None else f"{1000 * com:.0f}",
+            f"{1000 * (k['robust_margin'] if way is None else way):.0f}",
             f"{k['equilibrium_margin']:.2f}",
             k["limiting"] or "-",
         )

@@ -33,13 +33,21 @@ class PlanOptions:
         speed: Largest joint speed [rad/s], the thesis used 0.05; `max`: as fast as
             joints and contacts bear.
         max_changes: Contact changes that a policy may take.
+        robust: Keep to contact changes throughout which the `robust_margin` is
+            positive: mass, friction, centre of mass and contacts may be a little off.
         keyframe: Options of the posture optimisation.
     """
 
     method: Method = "direct"
     speed: Speed = 2.0
     max_changes: int = 1000
+    robust: bool = False
     keyframe: KeyframeOptions = field(default_factory=KeyframeOptions)
+
+    def __post_init__(self) -> None:
+        """A robust plan has robust keyframes."""
+        if self.robust and not self.keyframe.robust:
+            object.__setattr__(self, "keyframe", replace(self.keyframe, robust=True))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,12 +18,14 @@ from clamber.step.ik import IK
 from clamber.step.methods import METHODS, Method, direct
 from clamber.step.path import Phase, plan_path
 from clamber.step.posture import (
+    ROBUST_BALANCE,
     Keyframe,
     KeyframeOptions,
     KeyframeTask,
     finish,
     orientation_at,
 )
+from clamber.step.robust import robust_margin_along
 from clamber.step.stability import limiting_joint, out_of_reach
 from clamber.step.tasks import support_rotation
 from clamber.step.transition import (
@@ -188,14 +190,14 @@ def change_contact(
     for held in _footings(ik, before, step):
         found = None
         for key in _keyframes(ik, before, step, held, options, method):
-            found = _change(ik, before, key, step)
+            found = _change(ik, before, key, step, options)
             if isinstance(found, Change):
                 return found
         failure = failure or found
     if step.turns and step.makes is not None:
         for held in _footings(ik, before, step):
             key = _keyframe_turned(ik, before, step, held, options)
-            found = _change(ik, before, replace(key, method=method), step)
+            found = _change(ik, before, replace(key, method=method), step, options)
             if isinstance(found, Change):
                 return found
     if failure is None:
@@ -241,7 +243,9 @@ def _keyframes(
         wanted = next(c for c in key.stance if c.surface == wanted.surface)
 
 
-def _change(ik: IK, before: Keyframe, key: Keyframe, step: Step) -> Change | Failure:
+def _change(
+    ik: IK, before: Keyframe, key: Keyframe, step: Step, options: KeyframeOptions
+) -> Change | Failure:
     """The way to a keyframe with the largest of `MARGINS` for which there is one."""
     if key.status is not Status.SOLVED:
         detail = ""
@@ -252,13 +256,18 @@ def _change(ik: IK, before: Keyframe, key: Keyframe, step: Step) -> Change | Fai
             detail = out_of_reach(ik.kin, key.q, step.makes, pair)
         return Failure(status=key.status, step=step, detail=detail)
     status, detail = key.status, ""
-    for margin in MARGINS:
+    for margin in (MARGINS[0], ROBUST_BALANCE) if options.robust else MARGINS:
         transition = plan_transition(ik, before, key, step, margin=margin)
         status, detail = transition.status, transition.note
         if status is not Status.SOLVED:
             continue
         path = plan_path(ik, transition)
         status, detail = path.status, path.note
+        if status is Status.SOLVED and options.robust:
+            least = robust_margin_along(ik.kin, path.phases)
+            if least is not None and least < 0.0:
+                status = Status.UNBALANCED
+                detail = f"not robust: its worst margin is {1e3 * least:.0f} mm"
         if status is Status.SOLVED:
             return Change(
                 step=transition.step,

@@ -36,6 +36,8 @@ from clamber.step.tasks import SurfaceTask, closed, sliding, support_rotation
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
 CLEARANCE: float = _core.CLEARANCE  # [m] p_safe: of links from links and the scene
+# [m] balance margin of a robust plan: on level supports, what is off takes 3 cm of it.
+ROBUST_BALANCE = 0.031
 HOLD_WEIGHT = 40.0  # of a new contact at a position that an outer method prescribes
 
 
@@ -75,6 +77,7 @@ class KeyframeOptions:
         direction_weight: Of the demonstrated directions. Larger: looks more like the
             person; too large: contacts are missed.
         balance_margin: [m] the centre of mass stays this far inside the polygon.
+        robust: Only changes throughout which the `robust_margin` is positive.
         delta_stop: Stop when the cost changes by less (`lbfgs`, `gradient`).
         gradient_stop: Stop when the gradient's norm is below (`lbfgs`, `gradient`).
         max_iterations: Cap of the outer iterations.
@@ -85,6 +88,7 @@ class KeyframeOptions:
     reference_weight: float = 1.5
     direction_weight: float = 0.2
     balance_margin: float = 0.025
+    robust: bool = False
     delta_stop: float = 1e-6
     gradient_stop: float = 1e-3
     max_iterations: int = 200
@@ -133,7 +137,7 @@ def keyframe_problem(
         directions=task.directions,
         direction_weight=options.direction_weight,
         base_rotation=task.base_rotation,
-        balance_margin=options.balance_margin,
+        balance_margin=max(options.balance_margin, ROBUST_BALANCE * options.robust),
     )
 
 

@@ -60,6 +60,7 @@ class Climb:
         scene: A scene.yaml.
         method: How contact positions are optimised.
         speed: Largest joint speed [rad/s], or `max`.
+        robust: Keep to contact changes that hold in the worst case, see `PlanOptions`.
         controller: `pid` or `mixed`.
         contacts: `any`: others than the demonstrated ones where those have no stable
             plan; or `demonstrated` only.
@@ -74,6 +75,7 @@ class Climb:
     scene: str | None = None
     method: Method = field(default_factory=lambda: PlanOptions().method)
     speed: float | Literal["max"] = field(default_factory=lambda: PlanOptions().speed)
+    robust: bool = False
     controller: ControlMode = DEFAULT_CONTROLLER
     contacts: Contacts = "any"
     budget: float | None = None
@@ -252,7 +254,9 @@ def _plan(climb: Climb, folder: Path | None, progress: Progress) -> Plan:
         sequence,
         robot,
         scene,
-        options=PlanOptions(method=climb.method, speed=climb.speed),
+        options=PlanOptions(
+            method=climb.method, speed=climb.speed, robust=climb.robust
+        ),
         contacts=climb.contacts,
         budget=replace(climb.search, seconds=climb.budget),
         progress=progress,
