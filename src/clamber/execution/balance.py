@@ -26,7 +26,7 @@ from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
 from clamber.step.tasks import contact_rows
 
-HIGH, FADE = 0.022, 0.008  # [m] margin at which feedback sets in, and within how much
+HIGH, FADE = 0.045, 0.02  # [m] margin at which feedback sets in, and within how much
 SAG = 0.003  # [m] less than the planned margin is no danger
 P, D, T = 0.5, 0.1, 1.0  # gain; [s] of the rate; [s] of the integral
 MOST = 0.03  # [m]
