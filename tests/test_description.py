@@ -112,6 +112,24 @@ def test_the_same_holds_for_meshes_and_textures_of_an_mjcf(tmp_path, solid):
         assert compile_description(found, path).nmesh == 0
 
 
+def test_what_an_mjcf_includes_is_found_beside_it(tmp_path, monkeypatch):
+    text = humanoids.mjcf()
+    start = text.index('<body name="t1"')
+    end = text.index('<body name="u1"')
+    (tmp_path / "parts").mkdir()
+    leg = f"<mujocoinclude>{text[start:end]}</mujocoinclude>"
+    written(tmp_path, leg, "parts/leg.xml")
+    text = text[:start] + '<include file="parts/leg.xml"/>' + text[end:]
+    path = written(tmp_path, text, "robot.xml")
+    monkeypatch.chdir(tmp_path.parent)
+    for place in (path, path.relative_to(tmp_path.parent)):
+        model = compile_description(read_description(place), place)
+        assert model.njnt == 25
+    (tmp_path / "parts" / "leg.xml").unlink()
+    with pytest.raises(InputError, match=r"robot\.xml.*parts/leg\.xml"):
+        read_description(path)
+
+
 def test_a_shape_without_a_size_is_a_mark_and_no_shape(tmp_path):
     mark = '<collision><geometry><sphere radius="0"/></geometry></collision>'
     text = humanoids.urdf().replace("</link>", mark + "</link>", 1)

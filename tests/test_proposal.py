@@ -623,3 +623,30 @@ def test_a_new_robot_climbs_its_own_knee_height(proposed, demo_sequence, share):
     assert made.complete
     verdict = judge(made, simulate(made))
     assert verdict.reached, [n for n, c in verdict.criteria.items() if not c.ok]
+
+
+# Small robots from outside, where they are there.
+
+OUTSIDE = {
+    "knee-both": None, "forearm-ball": None,
+    "radius0": "'pelvis': a shape of size 0",
+    "visual-missing": "'pelvis': visual mesh .* is not there",
+    "stl-lfs": "'pelvis': visual mesh .* Git LFS pointer",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_outside_robots_are_proposed_with_nothing_wrong(shared, tmp_path, name):
+    path = shared / "cases" / "robots" / name / "robot.urdf"
+    if not path.is_file():
+        pytest.skip("the inputs are not there")
+    made = propose_robot(path)
+    robot = loaded(made, tmp_path)
+    assert check_robot(robot).faults == ()
+    for limb, side in (("left", "l"), ("right", "r")):
+        assert robot.limbs[f"{limb}_leg"].middle == f"{side}_shank"
+        assert robot.limbs[f"{limb}_arm"].middle == f"{side}_farm"
+        assert robot.home[f"{side}_knee"] > 0.5  # the foot goes back
+        assert robot.home[f"{side}_elbow"] < -0.3  # and the hand ahead
+    said = OUTSIDE[name]
+    assert said is None or any(re.search(said, n) for n in made.notes)
