@@ -12,8 +12,11 @@ import pytest
 import humanoids
 from clamber.errors import InputError
 from clamber.model.facing import side_told
+from clamber.model.kinematics import Kinematics
 from clamber.model.propose import Proposal, propose_robot
 from clamber.model.robot import Robot, load_robot
+from clamber.model.scene import Scene
+from clamber.model.world import build_world
 from clamber.planning.diagnose import check_robot
 from clamber.run.proposal import save_proposal
 
@@ -177,6 +180,28 @@ def test_a_forearm_whose_only_shape_is_a_ball_on_its_joint_is_bent(tmp_path):
     assert check_robot(robot).faults == ()
     model = mujoco.MjModel.from_xml_path(str(robot.path))
     assert model.geom("LHand").pos[2] < -0.15
+
+
+def test_arms_that_may_fold_any_way_are_mirror_images(tmp_path):
+    """Stretched out aside, as of a toy whose joints all turn around."""
+    text, around = humanoids.mjcf(), f'range="{-np.pi} {np.pi}"'
+    for tag, turn in (("v", "0.7071 0 0.7071 0"), ("w", "0.7071 0 -0.7071 0")):
+        start = text.index(f'<body name="{tag}1"')
+        end = text.index("</body>", text.index("</body>", start) + 1)
+        arm = re.sub(rf'<joint name="{tag}c".*/>', "", text[start:end])
+        arm = re.sub(r'range="[^"]*"', around, arm)
+        arm = arm.replace("<body", f'<body quat="{turn}"', 1)
+        arm = arm.replace(f'"{tag}a" axis="1 0 0"', f'"{tag}a" axis="0 0 1"')
+        arm = arm.replace(f'"{tag}d" axis="1 0 0"', f'"{tag}d" axis="0 1 0"')
+        elbow = f'name="{tag}2" pos="0 0'  # ahead of the shoulder
+        arm = arm.replace(elbow, elbow.replace("0 0", "0 0.03"))
+        text = text[:start] + arm + text[end:]
+    _, robot = proposed(tmp_path, text)
+    kin = Kinematics(build_world(robot, Scene(start=np.zeros(3))))
+    kin.update(kin.world.home)
+    for part in ("Hand", "Elbow"):
+        left, right = (kin.landmark(side + part)[1] for side in "LR")
+        np.testing.assert_allclose(left * [1, -1, 1], right, atol=5e-3)
 
 
 def test_a_collarbone_is_no_elbow(tmp_path):

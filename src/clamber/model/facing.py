@@ -25,6 +25,7 @@ CLOSE = 0.5  # of all that is told: a smaller majority is close
 BOTH_WAYS = 0.3  # of its larger range: a knee that bends so far the other way, too
 ALONG = 0.5  # cosine: a limb that folds this much ahead or back, not aside
 EYES = re.compile(r"camera|realsense|d435|zed|(^|[^a-z])eyes?([^a-z]|$)", re.IGNORECASE)
+TWINS = 0.99  # cosine of an axis to the other side's, seen in a mirror
 SIDES = (("left", "right"), ("links", "rechts"), ("lft", "rgt"), ("l", "r"))
 SOLE_DEPTH = 0.04  # share of the shank: points this near to the lowest are the sole
 
@@ -109,16 +110,49 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(names)
 
 
-def bending_as_people_do(tree: Tree, chain: Chain, way: np.ndarray) -> Chain:
-    """A limb that may fold both ways folds `way` (3,): feet back, hands ahead."""
-    low, high = _room(tree, chain)
-    both = min(low, high) > BOTH_WAYS * max(low, high)
-    along = float(_motion(tree, chain) @ way)
-    return (
-        replace(chain, sign=float(np.sign(along)))
-        if both and abs(along) > ALONG
-        else chain
-    )
+def bending_as_people_do(
+    tree: Tree, pair: Sequence[Chain], way: np.ndarray
+) -> list[Chain]:
+    """Limbs that may fold both ways fold `way` (3,): feet back, hands ahead.
+
+    Where that is aside, the right one folds as the left one's mirror image.
+    """
+    out, aside = [], 0
+    for chain in pair:
+        low, high = _room(tree, chain)
+        both = min(low, high) > BOTH_WAYS * max(low, high)
+        along = float(_motion(tree, chain) @ way)
+        if both and abs(along) > ALONG:
+            chain = replace(chain, sign=float(np.sign(along)))
+        out.append(chain)
+        aside += both and abs(along) <= ALONG
+    left, right = out
+    turns = mirrored_turns(tree, left, right, way)
+    if aside == len(out) and turns is not None:
+        out[1] = replace(right, sign=float(turns[right.bend]) * left.sign)
+    return out
+
+
+def mirrored_turns(
+    tree: Tree, left: Chain, right: Chain, forward: np.ndarray
+) -> np.ndarray | None:
+    """(J,) 1 or -1: right joints' angles by the left ones', as their mirror image.
+
+    None where the limbs' axes are not mirror images of each other at the zero posture.
+
+    Args:
+        tree: The description.
+        left: A limb of J joints.
+        right: Its other side.
+        forward: (3,) a horizontal unit vector, of either way.
+    """
+    if len(left.joints) != len(right.joints):
+        return None
+    across = np.cross([0.0, 0.0, 1.0], forward)
+    a, b = (tree.data.xaxis[list(c.joints)] for c in (left, right))
+    mirror = 2.0 * np.outer(a @ across, across) - a  # axes are not vectors
+    cosines = np.einsum("ji,ji->j", mirror, b)
+    return np.sign(cosines) if np.abs(cosines).min() > TWINS else None
 
 
 def sole_points(tree: Tree, leg: Chain) -> np.ndarray:

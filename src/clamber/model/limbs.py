@@ -103,8 +103,9 @@ def find_limbs(tree: Tree) -> Anatomy:
     limbs = {}
     for name, pair in chains.items():
         way = forward if name == "arm" else -forward
-        for side, c in zip(("left", "right"), pair, strict=True):
-            limbs[f"{side}_{name}"] = bending_as_people_do(tree, c, way)
+        folding = bending_as_people_do(tree, pair, way)
+        for side, c in zip(("left", "right"), folding, strict=True):
+            limbs[f"{side}_{name}"] = c
     used = {j for c in limbs.values() for j in c.joints} | {tree.root}
     carrying = set()
     for chain in limbs.values():

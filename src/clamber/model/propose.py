@@ -27,7 +27,7 @@ from clamber.model.description import (
     compile_description,
     read_description,
 )
-from clamber.model.facing import said_of_ahead
+from clamber.model.facing import mirrored_turns, said_of_ahead
 from clamber.model.limbs import Anatomy, find_limbs
 from clamber.model.progress import Progress, silent
 from clamber.model.records import short_repr
@@ -387,8 +387,7 @@ def nominal_posture(
     model, data = tree.model, mujoco.MjData(tree.model)
     legs = [(c, *_foot(tree, c, tree.data)) for c in found.pair("leg")]
     q = model.qpos0.copy()
-    for chain, side in zip(found.pair("arm"), (1.0, -1.0), strict=True):
-        _solve_arm(tree, q, chain, side)
+    _solve_arms(tree, q, *found.pair("arm"))
     ahead = 0.0
     for _ in range(4):
         for chain, middle, R in legs:
@@ -482,13 +481,35 @@ def _solve_leg(
     q[address] = x
 
 
-def _solve_arm(tree: Tree, q: np.ndarray, chain: Chain, side: float) -> None:
+def _solve_arms(tree: Tree, q: np.ndarray, left: Chain, right: Chain) -> None:
+    """Put the arms' angles into `q`: mirror images, where their joints are."""
+    model = tree.model
+    _solve_arm(tree, q, left, 1.0, _ways_to_begin(model, left))
+    turns = mirrored_turns(tree, left, right, np.array([1.0, 0.0, 0.0]))
+    starts = _ways_to_begin(model, right)
+    if turns is not None:
+        mirrored = turns * q[model.jnt_qposadr[list(left.joints)]]
+        starts = [np.clip(mirrored, *_bounds(model, right.joints))]
+    _solve_arm(tree, q, right, -1.0, starts)
+
+
+def _ways_to_begin(model: mujoco.MjModel, arm: Chain) -> list[np.ndarray]:
+    """Angles (J,) to solve an arm from: straight and bent."""
+    lo, hi = _bounds(model, arm.joints)
+    straight = np.clip(np.zeros(len(lo)), lo, hi)
+    bent = straight.copy()
+    bent[arm.bend] = np.clip(arm.sign * 1.5, lo[arm.bend], hi[arm.bend])
+    return [straight, bent]
+
+
+def _solve_arm(
+    tree: Tree, q: np.ndarray, chain: Chain, side: float, starts: Sequence[np.ndarray]
+) -> None:
     """Put an arm's angles into `q`; `side` is 1 on the left, -1 on the right."""
     model, data = tree.model, mujoco.MjData(tree.model)
     mirror = np.array([1.0, side, 1.0])
     upper, fore = np.array(UPPER_ARM) * mirror, np.array(FOREARM) * mirror
     address = model.jnt_qposadr[list(chain.joints)]
-    lo, hi = _bounds(model, chain.joints)
     wrist = np.arange(len(chain.joints)) > chain.bend
 
     def error(x: np.ndarray) -> np.ndarray:
@@ -501,10 +522,8 @@ def _solve_arm(tree: Tree, q: np.ndarray, chain: Chain, side: float) -> None:
         b = (far - at) / np.linalg.norm(far - at)
         return np.concatenate([a - upper, b - fore, np.where(wrist, 0.3, 0.03) * x])
 
-    straight = np.clip(np.zeros(len(lo)), lo, hi)
-    bent = straight.copy()
-    bent[chain.bend] = np.clip(chain.sign * 1.5, lo[chain.bend], hi[chain.bend])
-    solved = [least_squares(error, x, bounds=(lo, hi)) for x in (straight, bent)]
+    bounds = _bounds(model, chain.joints)
+    solved = [least_squares(error, x, bounds=bounds) for x in starts]
     q[address] = min(solved, key=lambda s: s.cost).x
 
 
