@@ -130,6 +130,20 @@ def test_what_an_mjcf_includes_is_found_beside_it(tmp_path, monkeypatch):
         read_description(path)
 
 
+def test_what_comes_again_does_not_matter(tmp_path, capfd):
+    (tmp_path / "t.stl").write_bytes(stl(CUBE))
+    text = humanoids.urdf(mesh="t.stl")
+    skins = '<material name="a"/><material name="b"/></visual>'
+    text = text.replace("</visual>", skins).replace(
+        "<collision>", '<collision name="c">'
+    )
+    path = written(tmp_path, text)
+    model = compile_description(read_description(path), path)
+    plain = written(tmp_path, humanoids.urdf(mesh="t.stl"), "plain.urdf")
+    assert model.ngeom == compile_description(read_description(plain), plain).ngeom
+    assert capfd.readouterr().err == ""
+
+
 def test_a_shape_without_a_size_is_a_mark_and_no_shape(tmp_path):
     mark = '<collision><geometry><sphere radius="0"/></geometry></collision>'
     text = humanoids.urdf().replace("</link>", mark + "</link>", 1)

@@ -223,15 +223,19 @@ def test_missing_effort_limits_are_guessed_said_so_or_taken_from_elsewhere(tmp_p
         propose_robot(path, effort_from=known)
 
 
-def test_efforts_of_motors_count_with_their_gear():
+@pytest.mark.parametrize(
+    ("gear", "most", "effort"), [(10, 2, 20.0), (20, 1, 20.0), (1, 1, None)]
+)
+def test_efforts_of_motors_count_with_their_gear(gear, most, effort):
+    """A motor from -1 to 1 and without a gear says nothing of its torque."""
     model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><body>
+        f"""<mujoco><worldbody><body>
         <joint name="a"/><geom size="0.1"/>
         </body></worldbody><actuator>
-        <motor joint="a" gear="10" ctrlrange="-2 2" ctrllimited="true"/>
+        <motor joint="a" gear="{gear}" ctrlrange="-{most} {most}" ctrllimited="true"/>
         </actuator></mujoco>"""
     )
-    assert effort_of(model, 0) == pytest.approx(20.0)
+    assert effort_of(model, 0) == effort
 
 
 def test_a_free_range_is_a_full_turn():

@@ -93,6 +93,7 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
             }
             _resolve_meshes(root, path, lenient, notes)
             _check_inertia(root, path, lenient, notes)
+            _without_repeats(root)
             _keep_all(root)
             text = ElementTree.tostring(root, encoding="unicode")
             spec = mujoco.MjSpec.from_string(text)
@@ -169,6 +170,20 @@ def _resolve_meshes(
                 raise InputError(f"a mesh (it {fault})", path, where, name)
             else:
                 mesh.set("filename", str(found.resolve()))
+
+
+def _without_repeats(root: ElementTree.Element) -> None:
+    """Keep the first of a shape's materials, and of shapes' names.
+
+    MuJoCo takes no second material, and warns of a name that comes again.
+    """
+    names = set()
+    for shape in [*root.iter("visual"), *root.iter("collision")]:
+        for material in shape.findall("material")[1:]:
+            shape.remove(material)
+        if shape.get("name") in names:
+            shape.attrib.pop("name")
+        names |= {shape.get("name")} - {None}
 
 
 def _fault(mesh: Path) -> str | None:

@@ -585,8 +585,10 @@ def effort_of(model: mujoco.MjModel, joint: int) -> float | None:
         if model.actuator_forcelimited[a]:
             found.append(gear * float(np.abs(model.actuator_forcerange[a]).max()))
         elif model.actuator_ctrllimited[a] and direct:
-            gain = abs(float(model.actuator_gainprm[a, 0]))
-            found.append(gear * gain * float(np.abs(model.actuator_ctrlrange[a]).max()))
+            gain = gear * abs(float(model.actuator_gainprm[a, 0]))
+            most = float(np.abs(model.actuator_ctrlrange[a]).max())
+            if gain != 1.0 or most != 1.0:  # else a share, of nobody knows what
+                found.append(gain * most)
     return min((x for x in found if x > 0), default=None)
 
 
