@@ -17,6 +17,7 @@ from clamber.errors import InputError
 from clamber.model.robot import load_robot
 from clamber.model.scene import Box, Scene
 from clamber.model.terrain import load_scene
+from clamber.model.world import build_world
 from clamber.planning.planner import plan
 from clamber.recording.demonstration import Demonstration
 from clamber.recording.detect import detect_contacts
@@ -29,6 +30,7 @@ from support.climb import ClimbOptions, synthesize_climb
 from support.files import bvh_text, c3d_bytes, from_z_up, trc_text
 
 UP = np.array([0.0, 0.0, 1.0])
+FLOOR = Scene(start=np.zeros(3))
 
 
 @cache
@@ -551,7 +553,9 @@ def test_a_robots_motion_is_a_demonstration(tmp_path):
     assert found(demo) == {("LFoot", "ground"), ("RFoot", "ground")}
 
 
-@pytest.mark.parametrize("form", ["qpos", "frames", "bodies", "named", "nested"])
+@pytest.mark.parametrize(
+    "form", ["qpos", "frames", "bodies", "named", "whole", "nested"]
+)
 def test_the_words_of_other_tools_say_the_same(tmp_path, form):
     motion = robot_motion("coman", samples=8)
     root, turn, dof = (motion[k] for k in ("root_pos", "root_rot", "dof_pos"))
@@ -560,17 +564,21 @@ def test_the_words_of_other_tools_say_the_same(tmp_path, form):
     names = None
     (tmp_path / "plain.pkl").write_bytes(pickle.dumps(motion))
     expected = load_demo(tmp_path / "plain.pkl", robot="coman").position
-    path = tmp_path / ("a.npz" if form in ("qpos", "bodies", "named") else "a.pkl")
+    path = tmp_path / (
+        "a.npz" if form in ("qpos", "bodies", "named", "whole") else "a.pkl"
+    )
     if form == "qpos":
         np.savez(path, qpos=np.hstack([root, w_first, dof]), fps=30)
     elif form == "bodies":
         np.savez(path, joint_pos=dof, body_pos_w=root[:, None].repeat(2, axis=1),
                  body_quat_w=w_first[:, None].repeat(2, axis=1), fps=[30])  # fmt: skip
+    elif form == "whole":  # and the first of its bodies is the world
+        names = np.array(build_world(load_robot("coman"), FLOOR).joints)
+        world = np.zeros((len(root), 2, 3)), np.tile([1.0, 0, 0, 0], (len(root), 2, 1))
+        np.savez(path, joint_pos=np.hstack([root, w_first, dof]), joint_names=names,
+                 body_pos_w=world[0], body_quat_w=world[1], fps=[30])  # fmt: skip
     elif form == "named":
-        from clamber.model.world import build_world
-
-        world = build_world(load_robot("coman"), Scene(start=np.zeros(3)))
-        names = np.array(world.joints)
+        names = np.array(build_world(load_robot("coman"), FLOOR).joints)
         np.savez(path, root_pos=root, root_quat=w_first, dof_pos=dof[:, ::-1],
                  dof_names=names[::-1], fps=30)  # fmt: skip
     elif form == "frames":

@@ -123,7 +123,9 @@ def _state(
         return whole[:, :3], whole[:, 3 : 3 + turn], whole[:, 3 + turn :], True
     joints = as_array(next(found[w] for w in _JOINTS if w in found))
     joints = joints.reshape(len(joints), -1)
-    n = len(joints)
+    n, names = len(joints), next((found[w] for w in _NAMES if w in found), None)
+    if names is not None and joints.shape[1] == np.size(names) + 7:  # the root's, too
+        return joints[:, :3], joints[:, 3:7], joints[:, 7:], True
     for place, turn in _BODIES:
         if place in found and turn in found:
             bodies = as_array(found[place]).reshape(n, -1, 3)
