@@ -109,7 +109,7 @@ def read_motion(
 
 
 def _state(
-    found: Mapping[str, object],
+    found: Mapping[str, Any],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
     """Root (T, 3), its turn (T, 3 or 4), joints (T, n), and whether w is usually first.
 
