@@ -529,7 +529,9 @@ ODD = re.compile(
     r"holds a push|\d weights\b|felt (for|on the way)|(parts|links?) that (is|are) no "
     r"surface|way of the (limb|surface)|did not make it|made it all the same|got there"
     r"|what is (only )?seen of|mass inside \[|probed for (again|in vain)|asked of key"
-    r"|red outside of it"
+    r"|red outside of it|\bmends?\b|\d m before the (ankles|robot)|coin toss"
+    r"|on nothing\b|see-through|(is|are|was) fed forward|bear [\d.]+ N m|gone on with"
+    r"|(is|was|are|were) felt\b|not felt\b|(is|are) told from"
 )
 
 

@@ -139,11 +139,11 @@ def test_each_mode_changes_the_picture_and_leaves_the_robot_in_it(
     view.tab.wait_for_timeout(1500)
     before = view.still()
     view.switch(mode, on)
-    changed = 200 if mode in ("shadows", "see-through robot") else 8
+    changed = 200 if mode in ("shadows", "transparent robot") else 8
     view.until(
         lambda: np.sum(np.abs(before - view.picture()).max(axis=2) > 12) > changed, mode
     )
-    faded = 4 if mode == "see-through robot" else 1
+    faded = 4 if mode == "transparent robot" else 1
     counts = [view.orange()]
     clock.toggle()
     view.tab.wait_for_timeout(300)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,8 @@ from PIL import Image
 from clamber.show.live import open_view
 
 SIZE = {"width": 900, "height": 620}
+PATIENCE = 60.0  # [s] that something is waited for, on a busy machine, and as many
+LOOKS = 30  # looks at least: a picture may take it seconds
 SCENE = {"x": 0, "y": 0, "width": 520, "height": 620}  # beside the panel
 # Where a point of the world is on the screen [px]; three.js has y up, we have z.
 ON_SCREEN = """([name, x, y, z]) => {
@@ -39,10 +42,12 @@ class Opened:
     complaints: list[str]
 
     def until(self, met: Callable[[], Any], told: object = "") -> None:
-        for _ in range(1800):  # a busy machine is waited for
+        end, looks = time.monotonic() + PATIENCE, 0
+        while looks < LOOKS or time.monotonic() < end:
             if met():
                 return
             self.tab.wait_for_timeout(50)
+            looks += 1
         pytest.fail(f"it never came: {told}")
 
     def row(self, label: str) -> Any:

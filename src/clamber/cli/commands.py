@@ -197,10 +197,7 @@ class PlanCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplanCommand:
-    """Other contacts than the demonstrated ones, ranked, the best planned; or the rest.
-
-    With --from the rest of a run is planned from where the robot is.
-    """
+    """Plan other contacts than the demonstrated ones; or, with --from, the rest."""
 
     source: Annotated[Path, tyro.conf.Positional, shown("SEQUENCE|RUN")]
     """A sequence.json; with --from, the run folder whose plan was followed."""
@@ -212,7 +209,7 @@ class ReplanCommand:
             help_behavior_hint="(default: from standing)",
         ),
     ] = None
-    """Where the robot is: a state file, or a time of the run's rollout."""
+    """Where the robot is: a state file, or a time of the run's rollout [s]."""
     world: Annotated[WorldFlags, Flat]
     planning: Annotated[PlanningFlags, Flat]
     search: SearchFlags = field(default_factory=SearchFlags)
@@ -375,7 +372,7 @@ class SimulateCommand:
     scene: Annotated[Path | None, shown("TRUTH")] = None
     """The scene.yaml that physics runs, where it is not the planned one."""
     pause: Annotated[float | None, shown("SECONDS")] = None
-    """When the robot is told to slow down and stand for 10 s, before it goes on."""
+    """When the robot is told to slow down and stand for 10 s; then it goes on."""
     execution: Annotated[ExecutionFlags, tyro.conf.arg(name="")]
     output: Printed
 

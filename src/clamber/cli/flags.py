@@ -64,7 +64,7 @@ def _left_out(
         metavar={int: "N", float: "X", str: "TEXT", Path: "FILE"}[kind],
         instance_from_str=value,
         is_instance=lambda x: x is None or isinstance(x, kind),
-        str_from_instance=lambda x: ["unset" if x is None else str(x)],
+        str_from_instance=lambda x: ["none" if x is None else str(x)],
     )
 
 
@@ -73,7 +73,7 @@ def shown(metavar: str, default: str | None = None) -> Any:
 
     def hint(value: str) -> str:
         told = value if default is None else default
-        return "" if told in ("None", "False") else f"(default: {told})"
+        return "" if told in ("", "none", "False") else f"(default: {told})"
 
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint)
 
@@ -119,7 +119,7 @@ class WorldFlags:
     robot: RobotName = "coman"
     """A robot by name, or a robot.yaml."""
     height: Annotated[float | None, shown("METRES", f"{DEFAULT_HEIGHT}")] = None
-    """One box of 1.0 x 1.2 m with this height, 0.23 m before the ankles."""
+    """One box of 1.0 x 1.2 m with this height, 0.23 m in front of the ankles."""
     scene: Annotated[
         Path | None,
         tyro.conf.arg(metavar="FILE", help_behavior_hint="(instead of --height)"),
@@ -157,7 +157,7 @@ class PlanningFlags:
     speed: Annotated[float | Literal["max"], shown("RAD/S|max")] = default_of(
         "planning.records", "PlanOptions", "speed"
     )
-    """Largest joint speed; max: as fast as joints and contacts bear."""
+    """Largest joint speed; max: as fast as torques and friction allow."""
     robust: Switch = False
     """Keep a margin for a mass, friction, CoM and contacts that are a little off."""
     budget: Annotated[float | None, shown("SECONDS", "no bound")] = None

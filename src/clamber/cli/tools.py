@@ -49,7 +49,7 @@ class RenderCommand:
     frame: Annotated[float | None, shown("T")] = None
     """One picture alone, at that time [s]."""
     camera: Literal["corner", "side", "front", "behind", "top"] = "corner"
-    """From where."""
+    """From where the robot is seen, as it faces at its start."""
     marks: Annotated[
         Literal["none", "contacts", "forces"] | None,
         tyro.conf.arg(
@@ -59,7 +59,7 @@ class RenderCommand:
     ] = None
     """What is drawn over a frame or a video: contacts, or these with their forces."""
     transparent: Switch = False
-    """Robot and obstacles on nothing; with --frame."""
+    """Without ground or sky, on a transparent background; with --frame."""
     size: Annotated[str | None, shown("1080p|WxH", "frames 1080p, videos 720p")] = None
     """Of the video, the frame, or each picture of the sheet."""
     out: Annotated[Path | None, shown("FILE", "in RUN")] = None
@@ -148,9 +148,9 @@ class ReportCommand:
     """Write a run as one HTML file: an animation to turn and scrub, plots, tables."""
 
     run_folder: RunFolder
-    """A run folder, whole or not."""
+    """A run folder, complete or not."""
     compare: Annotated[Path | None, shown("RUN2")] = None
-    """Another run, laid beside it."""
+    """Another run, shown beside it."""
     out: Annotated[Path | None, shown("FILE", "RUN/report.html")] = None
     """The file."""
     output: Printed
@@ -169,13 +169,12 @@ class ReportCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewCommand:
-    """Climb on a page in the browser, or look there at runs and edit a plan."""
+    """A page in the browser: climb, look at runs, edit a plan."""
 
     sources: Annotated[
         tuple[str, ...], tyro.conf.Positional, shown("RUN|RECORDING", "a new climb")
     ] = ()
-    """A run folder, whole or not, or several to lay side by side; a recording, or a
-    built-in demonstration by name. Without any: a page on which to choose and climb."""
+    """Run folders, shown beside each other; or a recording. Without: a start page."""
     demo: Annotated[str | None, shown("RECORDING|NAME", "the run's own")] = None
     """The recording that is shown beside a run."""
     scene: Annotated[Path | None, shown("FILE")] = None
@@ -326,8 +325,7 @@ class RobotCommand:
     action: tyro.conf.Positional[Literal["init", "check"]]
     """init: from an MJCF or URDF. check: a robot.yaml."""
     model: Annotated[str, tyro.conf.Positional, shown("MODEL")]
-    """init: an MJCF or URDF, or a humanoid by name (g1, icub, romeo, talos), where a
-    package that has it is installed.
+    """init: an MJCF or URDF; or g1, icub, romeo, talos, where a wheel has them.
     check: a robot.yaml, or a robot by name."""
     effort: Annotated[Path | None, shown("FILE")] = None
     """init: effort limits the model lacks: YAML {joint: N m}, or another model."""
@@ -411,7 +409,7 @@ class SweepCommand:
     scheduler: Annotated[str | None, shown("ADDRESS")] = None
     """A dask scheduler, whose workers do the runs instead."""
     out: Place = None
-    """The sweep's folder (runs/<name of the spec>); it is gone on with if it exists."""
+    """The sweep's folder (runs/<name of the spec>); a sweep in it goes on."""
     output: Printed
 
     def run(self) -> int:

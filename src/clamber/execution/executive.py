@@ -307,7 +307,7 @@ class Executive:
 
         self.estimate.expect(c, force=PRESSED)
         yield from ref.play(late, until=is_there)
-        # Where nothing at all is felt, torques that count on it would throw the robot.
+        # Without any load there, torques that count on it would throw the robot.
         missing = self.estimate.force(c) < LOST
         yield from ref.stop(until=is_there, push=span.touch if missing else None)
         self.estimate.expect()

@@ -42,7 +42,7 @@ class Reference:
     Attributes:
         trajectory: That is followed.
         track: The rows that are being followed.
-        q: (nq,); velocity: (na,) of the joints; torque: (na,) fed forward; closed:
+        q: (nq,); velocity: (na,) of the joints; torque: (na,) feed-forward; closed:
             (nS,) bool, contacts by surface. As of the last step, in place.
         left_plan: Something else than the first trajectory was followed.
         pause: [s] to stand still as soon as it can be, on the way; 0: go on.
@@ -120,7 +120,7 @@ class Reference:
 
         Args:
             until: Something happens: then it can go on without having stopped.
-            push: Sample whose torques are fed forward; None: of each.
+            push: Sample whose feed-forward torques are used; None: its own at each.
         """
         if not self.moves or (until is not None and until()):
             return
@@ -272,7 +272,7 @@ class Reference:
             down: To rest.
             ramp: Between rest and the planned speed [s].
             pace: Share of that at most.
-            push: Sample whose torques are fed forward all the way; None: of each.
+            push: Sample whose feed-forward torques are used throughout; None: its own.
         """
         i = self._place
         way = 1 if to > i else -1

@@ -11,8 +11,8 @@ one. The plane is then the maximum a posteriori, lowered until no contact lies b
 the box that is planned with is inside the real one, rough by what may stick out of it.
 
 Supports of a mesh are such planes each, `a` being the sum of how much higher the mesh
-is as a whole and how much more one support is: where one was felt, the others are
-believed higher as well.
+is as a whole and how much more one support is: where one was measured, the
+others are believed higher as well.
 """
 
 from __future__ import annotations

@@ -362,7 +362,7 @@ def _shrunk(shape: BaseGeometry, ragged: float) -> BaseGeometry:
 
 
 def _above_ground(region: Region) -> BaseGeometry:
-    """What of a region is over the plane z = 0, by more than it would be felt."""
+    """What of a region is over the plane z = 0, by more than would be measured."""
     n = region.rotation[2]  # z of a point (x, y, 0) of P is origin + n . (x, y, 0)
     size, tilt = 100.0, float(np.hypot(n[0], n[1]))
     z = region.world(shapely.get_coordinates(region.shape))[:, 2]

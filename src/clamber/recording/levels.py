@@ -127,7 +127,7 @@ def say_floor(floor: Level) -> str:
     what = {"Foot": "the feet rest", "Knee": "the knees rest", "Hand": "hands rest"}
     return (
         f"{what[floor.part]} {abs(floor.correction):.3f} m {way} the floor for "
-        f"{floor.seconds:.1f} s: --fit-floor mends it, or offset: "
+        f"{floor.seconds:.1f} s: --fit-floor corrects it, or offset: "
         f"{-floor.correction:.3f} in a recording.yaml"
     )
 

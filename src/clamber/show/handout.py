@@ -63,7 +63,7 @@ class Handout:
         return write_report(self._folder, out=there / REPORT).file
 
     def _picture(self, client: Any, there: Path) -> Path:
-        """As the browser shows it, on nothing."""
+        """As the browser shows it, on a transparent background."""
         height, width = client.camera.image_height, client.camera.image_width
         try:
             seen = client.get_render(

@@ -42,10 +42,10 @@ FOVY = 45.0  # [deg] of what has no model
 PERSON_LAYER = "recording"
 LAYERS = {  # name in the page: shown at first
     "planned posture": False,
-    "see-through robot": False,
+    "transparent robot": False,
     "contacts": True,
     "forces": True,
-    "balance": True,
+    "support polygon": True,
     "swing path": True,
     BEFORE_EDITING: False,
     PERSON_LAYER: False,

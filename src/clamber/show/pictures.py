@@ -396,7 +396,7 @@ def render_frame(
         out: The file; `frame-<time>.png` in the run folder by default.
         size: Width and height in pixels.
         camera: From where.
-        transparent: Robot and obstacles alone, on nothing.
+        transparent: Robot and obstacles alone, on a transparent background.
         marks: Whether contacts, or contacts with their forces, are drawn over it; of a
             plan, the least forces that hold the robot at rest.
 

@@ -352,7 +352,7 @@ class Camera:
         return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
     def cutout(self, q: np.ndarray, view: View) -> Image.Image:
-        """Robot and obstacles alone (RGBA), on nothing.
+        """Robot and obstacles alone (RGBA), on a transparent background.
 
         Averaged with its mask, so that no pixel mixes with what lies behind it: edges
         keep their own colour.

@@ -238,7 +238,7 @@ class Stage:
             if pale is not None:
                 pale.show(there, poses)
         self._robot.pose(poses)
-        self._robot.fade(SEE_THROUGH if layers["see-through robot"] else None)
+        self._robot.fade(SEE_THROUGH if layers["transparent robot"] else None)
         supports = list(m.world.supports.values())
         found = [
             (m.points[row, j], supports[m.support[row, j]], PHASE_COLOURS[phase])
@@ -247,7 +247,7 @@ class Stage:
         ]
         self._discs.show(found if layers["contacts"] else [])
         self._show_arrows(row, t, layers["forces"])
-        self._show_balance(row, layers["balance"])
+        self._show_balance(row, layers["support polygon"])
         way = next((w for end, w in self._swings if end > t), ())
         self._way.visible = layers["swing path"] and len(way) > 1
         if self._way.visible:

@@ -117,7 +117,7 @@ class StartPage:
         self._page, self._opened, self._count = page, opened, 0
         page.begin("New climb")
         gui, scene = page.server.gui, page.server.scene
-        text = "A person's motion, a robot, and something to climb."
+        text = "A demonstration, a robot, and an obstacle to climb."
         gui.add_html(paragraphs([text]))
         demos = {f"{name} (synthetic)": name for name in BUILT_IN}
         self._demo = Choice(page, "recording", demos, _recording, lambda: None)

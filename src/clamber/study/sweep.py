@@ -97,7 +97,7 @@ def run_sweep(
 
     Args:
         spec: What to run; with more `runs` than before, those are added.
-        folder: Holds `spec.yaml` and `runs.csv`; made, or gone on with.
+        folder: Holds `spec.yaml` and `runs.csv`; made, or continued.
         workers: Processes; None: one for each core.
         scheduler: Address of a `dask.distributed` scheduler, whose workers do the jobs
             in place of processes here.
@@ -457,7 +457,7 @@ def load_sweep(folder: str | Path) -> tuple[Spec, Rows]:
 
 @contextlib.contextmanager
 def _table(spec: Spec, folder: Path) -> Iterator[_Table]:
-    """The table of a folder, made or gone on with; no second sweep may write it."""
+    """The table of a folder, made or continued; no second sweep may write it."""
     path, copy = folder / TABLE, folder / SPEC
     try:
         folder.mkdir(parents=True, exist_ok=True)
