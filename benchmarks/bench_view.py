@@ -1,20 +1,30 @@
-"""How many states of a run the browser draws in a second.
+"""How soon a run is seen in the browser, and how many of its states are drawn a second.
 
     python benchmarks/bench_view.py RUN [--size 1280x800] [--seconds 5] [--rounds 3]
 
-Plays a run folder in headless Chromium; without a graphics card its software renderer
-draws. Counted in the page, while it plays: frames that were rendered, and among them
-those in which the robot's bodies were not where they were in the one before; medians of
+Opens the report and the view of a run folder in headless Chromium; without a graphics
+card its software renderer draws. Both are timed from the request: until the page has
+loaded, and until the first picture with the robot in it (COMAN: it is told by its
+orange; the time of that screenshot counts). Making them is timed apart.
+
+Then the view plays. Counted in the page: frames that were rendered, and among them
+those in which the robot's bodies were not where they were in the one before. Medians of
 the rounds. On an idle machine, or the figures are the machine's.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import shutil
+import tempfile
+import time
+from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 
 import clamber
@@ -22,6 +32,7 @@ from clamber.show.live import LAYERS
 
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 SETTLED = 4.0  # [s] until shaders are compiled
+ROBOT = 300  # pixels of orange
 # Looked at once for each frame of the browser: whether the renderer has run, and
 # whether the nodes of the robot are where they were.
 COUNT = """async seconds => {
@@ -49,6 +60,51 @@ COUNT = """async seconds => {
     requestAnimationFrame(look);
   });
 }"""
+
+
+def opening(browser: Browser, url: str, size: str) -> tuple[float, float]:
+    """[s] from the request until a page has loaded, and until the robot is seen."""
+    width, height = (int(x) for x in size.split("x"))
+    tab: Any = browser.new_page(viewport={"width": width, "height": height})
+    tab.set_default_timeout(120_000)
+    try:
+        begin = time.perf_counter()
+        tab.goto(url)
+        loaded = time.perf_counter() - begin
+        while not is_seen(tab.screenshot()):
+            pass
+        return loaded, time.perf_counter() - begin
+    finally:
+        tab.close()
+
+
+def is_seen(screenshot: bytes) -> bool:
+    """Whether the robot is in a picture."""
+    picture = np.asarray(Image.open(io.BytesIO(screenshot)).convert("RGB")).astype(int)
+    r, g, b = np.moveaxis(picture, 2, 0)
+    return bool(np.sum((r > 100) & (r > 2.5 * b) & (r > 1.3 * g)) > ROBOT)
+
+
+def openings(browser: Browser, run: str, size: str, rounds: int) -> None:
+    """How long report and view take to be made, to load and to show the robot."""
+    print(f"{'':20}{'made [s]':>9}{'loaded':>9}{'robot':>9}")
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        report = clamber.write_report(run, out=Path(folder) / "report.html").file
+        made = time.perf_counter() - begin
+        seen = [opening(browser, report.as_uri(), size) for _ in range(rounds)]
+        row = "".join(f"{median(x):9.1f}" for x in zip(*seen, strict=True))
+        megabytes = report.stat().st_size / 1e6
+        print(f"{'report':20}{made:9.1f}{row}   {megabytes:.1f} MB", flush=True)
+    begin = time.perf_counter()
+    page = clamber.open_view(run, port=8480)
+    made = time.perf_counter() - begin
+    try:
+        seen = [opening(browser, page.url, size) for _ in range(rounds)]
+    finally:
+        page.close()
+    row = "".join(f"{median(x):9.1f}" for x in zip(*seen, strict=True))
+    print(f"{'view':20}{made:9.1f}{row}", flush=True)
 
 
 def measure(
@@ -97,6 +153,7 @@ def main() -> None:
     }
     with sync_playwright() as p:
         browser = p.chromium.launch(executable_path=chromium, args=FLAGS)
+        openings(browser, asked.run, asked.size, asked.rounds)
         print(f"{'':20}{'states/s':>9}{'frames/s':>9}{'triangles':>11}")
         for name, layers in kinds.items():
             rounds = [

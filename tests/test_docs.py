@@ -556,6 +556,34 @@ def test_the_moving_picture_moves_and_is_small():
         above = page.read_text().split("\n## ")[0]
         assert "front.webp" in above
         assert "synthetic" in above
+    assert "(crossing.png)" in (ROOT / "docs" / "index.md").read_text()
+
+
+def test_the_readme_shows_says_and_runs_it_before_anything_else():
+    """Picture, a plain sentence, two commands, then Python, then results as a table."""
+    text = (ROOT / "README.md").read_text()
+    titles = re.findall(r"^## (.+)$", text, re.M)
+    assert titles[:3] == ["Two commands", "In Python", "Results"]
+    top, two, python, results = text.split("\n## ")[:4]
+    assert len(top.split()) < 140
+    assert text.index("front.webp") < 700
+    (block,) = re.findall(r"```sh\n(.*?)```", two, re.S)
+    assert [words[0] for words in commands(block)] == ["make", "make"]
+    assert "```python" in python
+    assert results.count("\n|") > 5
+    for paragraph in re.sub(r"```.*?```", "", text, flags=re.S).split("\n\n"):
+        if not paragraph.startswith("|"):
+            assert len(paragraph.split()) < 80, paragraph
+
+
+def test_pages_name_the_speed_that_is_the_default():
+    speed = f"{clamber.PlanOptions().speed:g} rad/s"
+    for name, said in {
+        "options.md": f"| `--speed` | {speed};",
+        "method.md": f"({speed} by default;",
+        "results.md": f"| {speed}, the default |",
+    }.items():
+        assert said in (ROOT / "docs" / name).read_text(), name
 
 
 def test_every_page_is_in_the_menu_and_every_public_name_in_the_reference():

@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -659,3 +661,8 @@ def test_no_phase_of_a_contact_is_red():
     """What the thesis calls sliding is held by friction in a run that succeeds."""
     for r, g, b in marks.PHASE_COLOURS.values():
         assert not (r > 180 and g < 100 and b < 100)
+    text = (files("clamber.show") / "web" / "report.js").read_text()
+    line = next(x for x in text.splitlines() if x.startswith("const PHASES ="))
+    said = dict(re.findall(r'"?([\w-]+)"?: "#(\w{6})"', line))
+    told = {k: bytes.fromhex(v) for k, v in said.items()}
+    assert told == {k: bytes(v) for k, v in marks.PHASE_COLOURS.items()}
