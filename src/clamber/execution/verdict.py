@@ -93,8 +93,8 @@ class Criterion:
 
     Attributes:
         value: In the unit that the figure's name says.
-        limit: The least or the most that is well, in the same unit.
-        ok: Whether it is.
+        limit: The smallest or the largest accepted value, in the same unit.
+        ok: Whether the value is within it.
     """
 
     value: float

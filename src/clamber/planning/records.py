@@ -31,7 +31,7 @@ class PlanOptions:
     Attributes:
         method: How contact positions are optimised.
         speed: Largest joint speed [rad/s], the thesis used 0.05; `max`: as fast as
-            joints and contacts bear.
+            torques and friction allow.
         max_changes: Contact changes that a policy may take.
         robust: Keep to contact changes throughout which the `robust_margin` is
             positive: mass, friction, centre of mass and contacts may be a little off.

@@ -272,7 +272,7 @@ def build_trajectory(
     Args:
         world: Robot and scene.
         phases: In order; each begins with the last posture of the one before.
-        speed: Largest joint speed [rad/s]; `max`: as fast as joints and contacts bear.
+        speed: Largest joint speed [rad/s]; `max`: as fast as joints and contacts allow.
         keyframe_after: How many phases end before each keyframe is reached.
 
     Raises:

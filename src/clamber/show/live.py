@@ -65,7 +65,7 @@ def open_view(
     """Serve a run or a recording, or the way to a first one, as a page in the browser.
 
     Args:
-        source: A run folder, whole or not; a recording, a `recording.yaml`, or a
+        source: A run folder, complete or not; a recording, a `recording.yaml`, or a
             built-in demonstration by name. None: a page on which to choose recording,
             robot and scene, and to climb.
         beside: Run folders that are shown to the right of it.

@@ -84,8 +84,8 @@ def write_report(
     """Write the report of a run as one HTML file.
 
     Args:
-        folder: A run folder, whole or not.
-        compare: Another one, laid beside it.
+        folder: A run folder, complete or not.
+        compare: Another one, shown beside it.
         out: The file; `report.html` in the run folder by default.
         progress: Called with stage, share and note.
 

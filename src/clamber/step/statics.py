@@ -216,8 +216,8 @@ class StaticEquilibrium:
         feasible: Whether they can: `margin >= 0` but for rounding.
         margin: The push margin: the largest horizontal force on the base [m g], along
             a line through the centre of mass, that the stance holds in every direction.
-            Negative: the least steady push without which it falls; -1 where no push up
-            to the weight helps. At most 1.
+            Negative: it falls unless a constant push of at least this size helps
+            it; -1 where no push up to the weight does. At most 1.
         limiting: The contact or joint that limits it: in the motion with which the
             stance gives way to the weakest push, the one that yields fastest (m/s of a
             contact, rad/s of a joint; the duals of the LP). A slipping contact; where
