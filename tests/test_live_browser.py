@@ -17,6 +17,7 @@ from PIL import Image
 
 import clamber
 from clamber.execution.simulation import Rollout
+from clamber.model.scene import NEAR_FACE
 from clamber.planning.records import Plan
 from clamber.show.chart import COLOURS
 from clamber.show.framing import PRESETS
@@ -249,19 +250,14 @@ def test_contacts_are_stepped_through_by_buttons_and_keys(view: Opened):
 
 
 def handed_out(view: Opened, button: str, *endings: str) -> bytes:
-    """The file that a button makes."""
-    view.click(button)
-    link = view.tab.locator(", ".join(f"a[download$='{x}']" for x in endings)).first
-    link.wait_for(state="attached")
-    name = link.get_attribute("download")
-    content = view.tab.evaluate(
-        """async a => { const x = await (await fetch(a.href)).arrayBuffer();
-           return btoa([...new Uint8Array(x)].map(c => String.fromCharCode(c)).join(""))
-        }""",
-        link.element_handle(),
-    )
+    """The file that a button makes, as the browser saves it."""
+    with view.tab.expect_download() as download:
+        view.click(button)
+    name = download.value.suggested_filename
     assert name.startswith("off_plan")
-    return base64.b64decode(content)
+    assert name.endswith(endings)
+    view.tab.wait_for_selector(f"text=Downloaded as {name}")
+    return Path(download.value.path()).read_bytes()
 
 
 def test_report_and_picture_are_handed_out(view: Opened):
@@ -433,6 +429,7 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
         assert (run / "edited" / "verdict.json").is_file()
         view.click("Undo all")
         tab.wait_for_selector("text=edited plan", state="detached")
+        view.folder("Surfaces")
         tab.get_by_text("use LHand").first.click()
         tab.wait_for_selector("text=without LHand")
         view.click("Re-plan")
@@ -447,7 +444,7 @@ def test_edits_are_undone_one_by_one_and_the_old_plan_stays_in_sight(
         view.until(lambda: view.orange() > ENOUGH)
         assert "stance 1: air -> LHand on box" in tab.inner_text("body")
         view.folder("Edit")
-        view.choose("move", "the box box")
+        view.choose("move", "obstacle box")
         view.until(
             lambda: np.any(pink_or_blue(view.picture())), "the box that is moved"
         )
@@ -457,6 +454,9 @@ def test_edits_are_undone_one_by_one_and_the_old_plan_stays_in_sight(
         view.choose("move", "LHand on box, stance 1")
         view.choose("onto", "ground")
         tab.wait_for_selector("text=onto ground")
+        gizmo: Any = page.server.scene.get_handle_by_name("/edit/contact")
+        view.until(lambda: gizmo.position[2] < 0.01, "the contact on the ground")
+        assert gizmo.position[0] < NEAR_FACE - 0.04  # in front of the box, not in it
         view.click("Undo")
         tab.wait_for_selector("text=onto ground", state="detached")
         assert tab.get_by_text("0.300 m high").count() == 1

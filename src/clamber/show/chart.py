@@ -16,6 +16,9 @@ MARGIN = 0.05  # above and below the series
 FEW = 5  # joints that are named
 COLOURS = ("#2563eb", "#c2410c", "#0891b2", "#d97706", "#7c3aed", "#db2777", "#15803d")
 NOW = "#dc2626"
+# The mark of the present has no value under the pointer: it is not in the legend.
+MARK = "clamber-now"
+STYLE = f"<style>.u-legend .{MARK} {{display: none}}</style>"
 _Series = Mapping[str, np.ndarray]  # (n,) by name
 
 
@@ -59,6 +62,7 @@ class Chart:
         gui = page.server.gui
         with gui.add_folder("Over time", expand_by_default=False) as self._folder:
             self._choice: Any = gui.add_dropdown("plot", ("",))
+            gui.add_html(STYLE)
         self._choice.on_update(lambda _: self._chosen())
         with page.clock.lock:
             self.renew()
@@ -100,7 +104,8 @@ class Chart:
         least, most = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
         room = MARGIN * (most - least) or 1.0
         points = {"show": True, "size": 8}
-        looks.append({"label": "now", "stroke": NOW, "points": points})
+        mark = {"label": "now", "stroke": NOW, "points": points, "class": MARK}
+        looks.append(mark)
         if self._plot is not None:
             self._plot.remove()
         with self._folder:

@@ -39,7 +39,8 @@ from clamber.show.track import EXECUTION, PLANNING
 INSET = 0.01  # [m] a contact that is dragged stays so far inside its support
 FOLDER = "edited"  # in the run folder
 GIZMO = 0.22  # [m]
-NOTHING, BOX = "none", "the box "  # what is moved
+BESIDE = 0.05  # [m] from a box that stands where a contact is moved to
+NOTHING, BOX = "none", "obstacle "  # what is moved
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -219,7 +220,6 @@ class Editor:
         self._height = gui.add_number(
             "height [m]", 0.3, min=0.01, step=0.005, visible=False
         )
-        self._use = {s: gui.add_checkbox(f"use {s}", True) for s in surfaces}
         buttons: dict[str, tuple[Callable[[], str], *tuple[str, ...]]] = {
             "Re-plan": (self._plan_again, *PLANNING[:2]),
             "Simulate": (self._run_physics, *EXECUTION[:1]),
@@ -229,6 +229,8 @@ class Editor:
         }
         self._handles = {n: gui.add_button(n) for n in buttons}
         self._work = Work(gui, self._tell)
+        with gui.add_folder("Surfaces", expand_by_default=False):
+            self._use = {s: gui.add_checkbox(f"use {s}", True) for s in surfaces}
         self._gizmo = page.server.scene.add_transform_controls(
             "/edit/contact",
             scale=GIZMO,
@@ -312,13 +314,20 @@ class Editor:
             self._put_box(replace(box, centre=at))
 
     def _moved_onto(self) -> None:
-        """A contact goes to the nearest place of another support."""
+        """A contact goes to the nearest place of another support, under no box."""
         name, box = self._chosen()
         support = str(self._onto.value)
         if box is not None or name == NOTHING:
             return
-        if support != self._place(name)[0]:
-            self._put_contact(name, support, self._place(name)[1])
+        before, place = self._place(name)
+        if support != before:
+            on = self._plan.world.supports[support]
+            for other in edited_scene(self._plan, self._edits).boxes:
+                top = other.top
+                if top.inside(place) and top.level(place) > on.level(place):
+                    edge = top.edge_towards(place)
+                    place = edge.point - BESIDE * np.array([*edge.inward, 0.0])
+            self._put_contact(name, support, place)
 
     def _resized(self) -> None:
         """A box of another height stands where it stood."""

@@ -56,8 +56,8 @@ class Handout:
         with tempfile.TemporaryDirectory() as there:
             file = make(client, Path(there))
             name = f"{self._folder.resolve().name}{file.suffix}"
-            client.send_file_download(name, file.read_bytes())
-        return ""
+            client.send_file_download(name, file.read_bytes(), save_immediately=True)
+        return f"Downloaded as {name}"
 
     def _report(self, _: Any, there: Path) -> Path:
         return write_report(self._folder, out=there / REPORT).file

@@ -207,9 +207,14 @@ class _Told:
         self._line.content = f'<p style="{look}">{said}</p>'
         rows = () if verdict is None else verdict.rows()
         self._rows.content = rows_of(
-            (label if ok else f"{label}: NOT MET", value, limit)
+            (label if ok else f"{label}: NOT MET", value, _short(limit))
             for label, value, limit, ok in rows
         )
+
+
+def _short(limit: str) -> str:
+    """A limit in a narrow column."""
+    return limit.replace("at least", "≥").replace("at most", "≤")
 
 
 def _outcome(verdict: Verdict) -> str:

@@ -456,10 +456,14 @@ def paragraphs(texts: Sequence[str]) -> str:
 
 
 def rows_of(rows: Iterable[Sequence[str]]) -> str:
-    """A table as HTML; the texts are no markup."""
-    cell = '<td style="padding: 1px 12px 1px 0; vertical-align: top">'
-    lines = ("".join(f"{cell}{html.escape(x)}</td>" for x in row) for row in rows)
-    rows = "".join(f"<tr>{line}</tr>" for line in lines)
+    """A table as HTML, only its first column broken; the texts are no markup."""
+    look = "padding: 1px 12px 1px 0; vertical-align: top"
+    first, other = f'<td style="{look}">', f'<td style="{look}; white-space: nowrap">'
+    lines = []
+    for head, *others in rows:
+        cells = [first + html.escape(head), *(other + html.escape(x) for x in others)]
+        lines.append(f"<tr>{'</td>'.join(cells)}</td></tr>")
+    rows = "".join(lines)
     return f'<table style="font-size: 13px; margin: 4px 12px">{rows}</table>'
 
 

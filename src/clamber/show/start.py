@@ -16,7 +16,6 @@ import yaml
 
 from clamber.errors import ClamberError, InputError
 from clamber.model.kinematics import Kinematics
-from clamber.model.propose import propose_robot
 from clamber.model.robot import PROPOSED, ROBOTS, load_robot
 from clamber.model.scene import NEAR_FACE, Box, Scene
 from clamber.model.terrain import load_scene
@@ -26,7 +25,6 @@ from clamber.recording.built_in import BUILT_IN
 from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import new_run_folder, next_free_folder
-from clamber.run.proposal import save_proposal
 from clamber.show.framing import robot_corners
 from clamber.show.meshes import body_meshes, body_poses
 from clamber.show.page import Page, Work, paragraphs
@@ -292,6 +290,10 @@ def make_of_wheel(robot: str) -> None:
 
 def _propose(model: str | Path, folder: Path) -> None:
     """Write what is proposed of a model to a new folder."""
+    # Slow to import, and rarely needed.
+    from clamber.model.propose import propose_robot
+    from clamber.run.proposal import save_proposal
+
     proposal = propose_robot(model)
     folder.mkdir(parents=True)
     save_proposal(proposal, folder)

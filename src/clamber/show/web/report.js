@@ -367,13 +367,13 @@ function plot(title, motion, lines, values, { limits = [], range: [low, high], d
 const colourOf = (j) => PALETTE[j % PALETTE.length];
 // What can be plotted: title, and for a run its lines and limits, or null.
 const PLOTS = [
-  ["Joint torque, share of its limit", (run, m) => {
+  ["Joint torque [% of its limit]", (run, m) => {
     if (!m.arrays.effort) return null;
     const peaks = m.joints.map((j, i) => [i, Math.max(...m.times.map((_, r) => Math.abs(m.arrays.effort(r, i))))]).sort((a, b) => b[1] - a[1]);
     const most = peaks.slice(0, 5).map(([i]) => i), lines = [];
-    m.joints.forEach((name, i) => most.includes(i) || lines.push({ name, faint: true, colour: "#94a3b8", at: (r) => m.arrays.effort(r, i) }));
-    most.forEach((i, k) => lines.push({ name: `${m.joints[i]} (${neat(m.effortLimits[i])} N m)`, colour: colourOf([0, 2, 4, 6, 5][k]), at: (r) => m.arrays.effort(r, i) }));
-    return { lines, limits: [{ value: 1, name: "limit" }, { value: -1 }], at: [-1.08, 1.08] };
+    m.joints.forEach((name, i) => most.includes(i) || lines.push({ name, faint: true, colour: "#94a3b8", at: (r) => 100 * m.arrays.effort(r, i) }));
+    most.forEach((i, k) => lines.push({ name: `${m.joints[i]} (${neat(m.effortLimits[i])} N m)`, colour: colourOf([0, 2, 4, 6, 5][k]), at: (r) => 100 * m.arrays.effort(r, i) }));
+    return { lines, limits: [{ value: 100, name: "limit" }, { value: -100 }], at: [-108, 108], digits: 0 };
   }],
   ["CoM margin in the support polygon [m]", (run, m) => {
     if (!m.arrays.margin) return null;
@@ -390,8 +390,8 @@ const PLOTS = [
     if (m.arrays.pushSize) lines.push({ name: "push on the pelvis", colour: "#a21caf", at: (r) => m.arrays.pushSize(r) });
     return { lines, limits: [{ value: m.weight, name: "weight", colour: "#64748b" }], floor: 0, digits: 0 };
   }],
-  ["Projected distance, share of its guide value", (run, m) => m.arrays.ratio && {
-    lines: m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => ((m.arrays.loaded || m.arrays.planned)(r, j) > 0 ? m.arrays.ratio(r, j) : NaN) })), limits: [{ value: 1, name: "guide value", colour: "#64748b" }], floor: 0 }],
+  ["Projected distance [% of its guide value]", (run, m) => m.arrays.ratio && {
+    lines: m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => ((m.arrays.loaded || m.arrays.planned)(r, j) > 0 ? 100 * m.arrays.ratio(r, j) : NaN) })), limits: [{ value: 100, name: "guide value", colour: "#64748b" }], floor: 0, digits: 0 }],
   ["Heights of the arms' surfaces [m]; bold: loaded", (run, m) => heights(m, true)],
   ["Heights of the legs' surfaces [m]; bold: loaded", (run, m) => heights(m, false)],
 ];
@@ -481,7 +481,7 @@ function stances(run) {
   if (!run.keyframes.length) return el("p", { class: "note" }, "No plan.");
   const rows = (k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
-      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), PHASE_NAMES[c.phase] || c.phase), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
+      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), (PHASE_NAMES[c.phase] || c.phase).replace("contact-angle ", "")), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
   const made = table(["", "contact change", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "push margin [m g]", "limited by"], [], "stances"), body = made.querySelector("tbody");
   const pager = paged(run.keyframes.length, 20, (from, to) => body.replaceChildren(...run.keyframes.slice(from, to).flatMap((k, n) => rows(k, from + n))));
   const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "reason"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
