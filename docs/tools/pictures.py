@@ -249,7 +249,7 @@ def paths(plan) -> Figure:
 
 
 def trajectory(plan, fast) -> Figure:
-    """The fastest joint over time, at 0.3 rad/s and as fast as it can."""
+    """The fastest joint over time, at the speed of the plan and as fast as it can."""
     fig = Figure(figsize=(7, 3.2), layout="constrained")
     slow_ax, fast_ax = fig.subplots(2, 1)
     for ax, p, colour in ((slow_ax, plan, BLUE), (fast_ax, fast, RED)):
@@ -259,9 +259,8 @@ def trajectory(plan, fast) -> Figure:
         for k in t.keyframes:
             ax.axvline(k, color=GREY, ls=":", lw=0.8)
         ax.set_ylabel("fastest joint [rad/s]")
+        ax.set_title(f"--speed {p.options.speed}", loc="left")
         ax.spines[["top", "right"]].set_visible(False)
-    slow_ax.set_title("--speed 0.3", loc="left")
-    fast_ax.set_title("--speed max", loc="left")
     fast_ax.set_xlabel("time [s]; dotted: keyframes")
     return fig
 
