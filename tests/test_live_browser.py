@@ -311,6 +311,7 @@ def test_values_are_read_off_a_plot_and_the_present_is_marked(view: Opened):
     time, *forces = (float(x) for x in read()[:9] if x != "--")
     assert abs(time - 0.5 * page.clock.end) < 0.1 * page.clock.end
     assert sum(forces) > 0.5 * 26 * 9.81  # it is carried
+    assert "NaN" not in tab.locator(".u-legend").first.inner_text()
     marks = """() => Object.values(window.__viserTestpoints.uplots)[0].chart
       .data.at(-1).findIndex(x => !Number.isNaN(x))"""
     first = tab.evaluate(marks)
