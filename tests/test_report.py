@@ -24,6 +24,7 @@ from clamber.model.world import PHYSICS_STEP
 from clamber.planning.records import Fallback, Plan
 from clamber.run import folder as run_files
 from clamber.show import report
+from clamber.step.robust import robust_margin
 
 NASTY = "</script><script>document.title='taken'</script><img src=x onerror=alert(1)>"
 
@@ -203,6 +204,8 @@ def test_the_table_of_stances_has_the_figures_of_the_plan(whole: Path, plan: Pla
     rows = report.run_record(whole)["keyframes"]
     for row, key in zip(rows, plan.keyframes, strict=True):
         assert row["com_margin"] == pytest.approx(key.com_margin)
+        robust = robust_margin(Kinematics(plan.world), key.q, key.stance)
+        assert row["robust_margin"] == pytest.approx(robust)
         assert row["margin"] == pytest.approx(key.equilibrium.margin)
         total = np.sum([c["force"] for c in row["contacts"]], axis=0)
         np.testing.assert_allclose(total, [0, 0, plan.world.mass * 9.81], atol=0.5)

@@ -50,6 +50,7 @@ from clamber.run.codec import (
 from clamber.run.forms import CODEC
 from clamber.step.change import Change
 from clamber.step.posture import Keyframe
+from clamber.step.robust import robust_margin
 from clamber.step.stability import statics_at
 
 SEQUENCE = "sequence.json"
@@ -251,10 +252,11 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
-    """A keyframe by the keys of `plan.json`, and where its forces act."""
+    """A keyframe by the keys of `plan.json`, robust margin and places of forces, too."""
     points, *_ = statics_at(kin, k.q, k.stance)
     acting = {"surfaces": points.names, "points": points.points}
     out = CODEC.encode(k)
+    out["robust_margin"] = robust_margin(kin, k.q, k.stance)
     out["static_equilibrium"] |= CODEC.encode(acting)
     return out
 

@@ -34,6 +34,7 @@ from clamber.show.live import open_view
 from clamber.show.page import Page
 from clamber.show.renderer import Camera
 from clamber.show.skeleton import skeleton_of
+from clamber.step.robust import robust_margin
 
 TILE = (220, 220)  # [px] of a posture
 TILES = 4
@@ -149,11 +150,13 @@ def _schedule(sequence: ContactSequence) -> bytes:
 
 
 def _plan(plan: Plan) -> _Cell:
-    rows = [["", "change", "CoM margin [mm]", "push margin [m g]"]]
+    rows = [["", "change", "CoM margin [mm]", "robust [mm]", "push margin [m g]"]]
+    kin = Kinematics(plan.world)
     for i, key in enumerate(plan.keyframes):
         step = "start" if i == 0 else str(plan.changes[i - 1].step)
         margin = f"{key.equilibrium.margin:.2f}"
-        rows.append([str(i), step, f"{1000 * key.com_margin:.0f}", margin])
+        robust = f"{1000 * robust_margin(kin, key.q, key.stance):.0f}"
+        rows.append([str(i), step, f"{1000 * key.com_margin:.0f}", robust, margin])
     end = "complete" if plan.complete else f"incomplete: {plan.why_not}"
     seconds = 0.0 if plan.trajectory is None else plan.trajectory.time[-1]
     line = f"Plan: {len(plan.changes)} contact changes in {seconds:.1f} s, {end}"

@@ -166,6 +166,7 @@ def stance_rows(
                 "move": move,
                 "time": time,
                 "com_margin": key["com_margin"],
+                "robust_margin": key.get("robust_margin"),  # none in older runs
                 "margin": e["margin"],
                 "limiting": e["limiting"],
                 "contacts": [

@@ -35,6 +35,7 @@ from clamber.show.sample import (
     thinned,
 )
 from clamber.show.skeleton import Skeleton
+from clamber.step.robust import robust_margin
 
 # One level of meshes, at rest and in motion, that a processor draws in time too.
 TRIANGLES, DEVIATION = 15_000, 0.0008  # [m] that faces may be off a round geom
@@ -180,6 +181,8 @@ class Stage:
         trajectory = plan.trajectory if as_planned else None
         self._swings = [] if trajectory is None else swings_of(m, trajectory)
         self._forces = [force_by_contact(plan.world, k) for k in plan.keyframes]
+        kin = Kinematics(plan.world)
+        self._robust = [robust_margin(kin, k.q, k.stance) for k in plan.keyframes]
         self._kin = Kinematics(m.world)
         self._weight = m.world.mass * 9.81
         add = server.scene
@@ -256,6 +259,10 @@ class Stage:
         facts = [f"{t:.2f} of {self.duration:.1f} s; {under_way}"]
         if math.isfinite(m.margin[row]):
             facts.append(f"CoM margin {1000 * m.margin[row]:.0f} mm")
+        pairs = zip(self._robust, self.reached, strict=True)
+        made = [robust for robust, at in pairs if at is not None and at <= t]
+        if made:
+            facts.append(f"robust margin {1000 * made[-1]:.0f} mm at the keyframe")
         return paragraphs(facts)
 
     def seen(self) -> np.ndarray:
