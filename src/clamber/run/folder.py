@@ -252,7 +252,7 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
 
 
 def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
-    """A keyframe by the keys of `plan.json`, robust margin and places of forces, too."""
+    """A keyframe by the keys of `plan.json`; its robust margin, where forces act."""
     points, *_ = statics_at(kin, k.q, k.stance)
     acting = {"surfaces": points.names, "points": points.points}
     out = CODEC.encode(k)
