@@ -435,7 +435,7 @@ function sheet(run, motion, i) {
     const canvas = el("canvas", { width: 480, height: 384, "data-run": i, "data-keyframe": n });
     later(canvas, () => { STILLS.push(canvas); drawStills(); });
     return el("figure", { ...clickable(k.time, `keyframe ${n}`), class: `tile ${k.time === null ? "unreached" : "go"}` }, canvas,
-      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM margin ${k.com_margin === null ? "–" : fixed(1000 * k.com_margin, 0)} mm, robust ${millimetres(k.robust_margin)} mm, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
+      el("figcaption", {}, el("b", {}, `${n}  ${k.move}`), el("br"), `CoM margin ${millimetres(k.com_margin)} mm, robust ${millimetres(k.robust_margin)} mm, push margin ${fixed(k.margin, 2)} m g`, k.time === null && el("em", {}, " — not reached")));
   };
   const box = el("div", { class: "sheet" });
   return [box, paged(run.keyframes.length, 12, (from, to) => box.replaceChildren(...run.keyframes.slice(from, to).map((k, n) => tile(k, from + n))))];
@@ -485,8 +485,8 @@ function stances(run) {
   if (!run.keyframes.length) return el("p", { class: "note" }, "No plan.");
   const rows = (k, n) => k.contacts.map((c, j) => el("tr", { ...clickable(k.time, `stance ${n}`), "data-stance": j === 0 ? n : false, class: `${j === 0 ? "first " : ""}${k.time === null ? "unreached" : "go"}` },
     cells([j ? "" : String(n), j ? "" : k.move, j ? "" : k.time === null ? "not reached" : fixed(k.time, 2), c.surface, c.support, fixed(1000 * c.projected_distance, 0), fixed((180 / Math.PI) * c.contact_angle, 1),
-      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), (PHASE_NAMES[c.phase] || c.phase).replace("contact-angle ", "")), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j || k.com_margin === null ? "" : fixed(1000 * k.com_margin, 0), j ? "" : millimetres(k.robust_margin), j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
-  const made = table(["", "contact change", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM [mm]", "robust [mm]", "push margin [m g]", "limited by"], [], "stances"), body = made.querySelector("tbody");
+      el("span", { class: "phase" }, el("i", { style: { background: PHASES[c.phase] || "#64748b" } }), (PHASE_NAMES[c.phase] || c.phase).replace("contact-angle ", "")), c.force ? fixed(Math.hypot(...c.force), 0) : "–", j ? "" : `${millimetres(k.com_margin)} (${millimetres(k.robust_margin)})`, j ? "" : fixed(k.margin, 2), j ? "" : k.limiting || "–"])));
+  const made = table(["", "contact change", "t [s]", "surface", "support", "d [mm]", "θ [°]", "phase", "force [N]", "CoM (robust) [mm]", "push [m g]", "limited by"], [], "stances"), body = made.querySelector("tbody");
   const pager = paged(run.keyframes.length, 20, (from, to) => body.replaceChildren(...run.keyframes.slice(from, to).flatMap((k, n) => rows(k, from + n))));
   const skipped = run.skipped.length ? [el("h3", {}, "Left out"), table(["stance", "reason"], run.skipped.map((s) => el("tr", {}, cells([s.stance, s.reason]))))] : [];
   return [RUNS.length > 1 && el("h3", {}, run.title), made, pager, ...skipped];
