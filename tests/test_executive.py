@@ -803,3 +803,14 @@ def test_open_loop_the_trajectory_is_followed_sample_by_sample(demo_plan, rng):
     assert follower.events == []
     assert follower.followed is None
     assert sorted(follower.rests_on) == described(demo_plan.keyframes[-1].stance)
+
+
+def test_where_nothing_robust_is_left_to_do_the_rest_need_not_be(
+    hands_plan, monkeypatch
+):
+    """A top that is elsewhere leaves no robust rest: that is no reason to stop."""
+    options = replace(hands_plan.options, robust=True)
+    monkeypatch.setattr("clamber.step.robust.COM", 0.5)
+    rollout = run(replace(hands_plan, options=options), height=0.03, **EXACT)
+    assert Replanned in kinds(rollout.events)
+    assert Stopped not in kinds(rollout.events)

@@ -652,15 +652,16 @@ def _rest(
     """What is left to do of a plan, in the scene as it is believed to be.
 
     Where contacts are so far `off` that the plan at hand will not do, other ones than
-    the demonstrated may.
+    the demonstrated may. Where nothing robust is left to do, it need not be.
     """
+    options = made.options
     try:
-        return plan(
+        found = plan(
             made.policy or made.sequence,
             made.world.robot,
             scene,
             start=start,
-            options=made.options,
+            options=options,
             contacts="any" if off >= FALLBACK else "demonstrated",
             budget=Budget(ahead=HORIZON),
             clearance=clearance,
@@ -668,6 +669,12 @@ def _rest(
                 stage, done, f"planning again: {note}"
             ),
         )
+        if not (options.robust and found.failures):
+            return found
+        keyframe = replace(options.keyframe, robust=False)
+        usual = replace(options, robust=False, keyframe=keyframe)
+        made = replace(made, options=usual)
+        return _rest(made, scene, start, off, clearance, report)
     except InputError as e:
         failure = Failure(status=Status.UNREACHABLE, detail=str(e))
         return replace(
