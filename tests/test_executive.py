@@ -811,6 +811,6 @@ def test_where_nothing_robust_is_left_to_do_the_rest_need_not_be(
     """A top that is elsewhere leaves no robust rest: that is no reason to stop."""
     options = replace(hands_plan.options, robust=True)
     monkeypatch.setattr("clamber.step.robust.COM", 0.5)
-    rollout = run(replace(hands_plan, options=options), height=0.03, **EXACT)
+    rollout = run(replace(hands_plan, options=options), height=0.05, **EXACT)
     assert Replanned in kinds(rollout.events)
     assert Stopped not in kinds(rollout.events)
