@@ -122,7 +122,7 @@ def at_margin(kin: Kinematics, q: np.ndarray, contacts, margin: float) -> np.nda
 def test_with_its_margin_the_robot_is_let_alone(demo_plan, kin):
     """To the last bit, whatever its deviation."""
     q, contacts = demo_plan.start.q, demo_plan.start.stance
-    assert margin_of(kin, q, contacts) > HIGH + 0.011
+    assert margin_of(kin, q, contacts) > HIGH + 0.02
     n = outward(kin, q, contacts)
     aside = moved(kin, q, 0.01 * n, contacts)
     assert not answered(demo_plan, aside, q, contacts, ticks=100).any()

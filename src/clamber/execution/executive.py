@@ -517,7 +517,7 @@ class Executive:
         off = max(max(abs(u), s) for u, s in map(estimate.deviation, contacts))
         if len(contacts) < len(self.stance):
             off = np.inf  # without a contact there is no going on as planned
-        estimate.remember([estimate.measured(c) for c in contacts], self.done)
+        estimate.remember(contacts, self.done)
         q = self.reference.copy()  # joints as commanded, base as measured
         q[:7] = estimate.q[:7]
         aimed = {c: estimate.aimed(c, q) for c in contacts}
