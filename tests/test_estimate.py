@@ -178,6 +178,27 @@ def test_another_surface_of_the_limb_may_be_loaded_in_place_of_the_planned_one(
         assert estimate.substitute(hand) is None
 
 
+def test_a_limb_may_be_back_on_another_support(estimate, demo_plan):
+    """A foot bears on the ground, however tilted, where its knee was on the box."""
+    start, end = demo_plan.keyframes[0], demo_plan.keyframes[-1]
+    knee = next(c for c in end.stance if c.surface == "LKnee")
+    q = start.q.copy()
+    ankle = demo_plan.world.model.joint("LAnkSag").qposadr[0]
+    for turned in (0.0, 0.5):
+        q[ankle] = start.q[ankle] + turned
+        settle(estimate, q, LFoot=1.1 * TOUCH)
+        found = estimate.substitute(knee)
+        assert found is not None
+        assert (found.surface, found.support) == ("LFoot", "ground")
+        assert np.allclose(found.position, estimate.point(found))
+        assert estimate.substitute(knee, there=True) is None
+        assert not estimate.is_lost(knee)
+    q[:3] += [0.0, 0.0, REACH + 0.05]
+    settle(estimate, q, LFoot=100.0)
+    assert estimate.substitute(knee) is None
+    assert estimate.is_lost(knee)
+
+
 def test_a_measured_contact_is_where_the_surface_is(estimate, hands_plan):
     c = placed(estimate, hands_plan, 1, -0.03, 0.01)
     found, kin = estimate.measured(c), Kinematics(hands_plan.world)

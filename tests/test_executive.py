@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clamber.errors import InputError, Status
-from clamber.execution import executive, unintended
+from clamber.execution import executive, progress, unintended
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.estimate import LOST, TOUCH
 from clamber.execution.events import (
@@ -35,16 +35,17 @@ from clamber.execution.executive import (
     START_DRIFT,
     THINKING,
     Executive,
-    OpenLoop,
 )
+from clamber.execution.open_loop import OpenLoop
 from clamber.execution.probe import PROBE_SPEED, REACH
 from clamber.execution.reference import RAMP, STEPS
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import joint_servo, self_positioning_joints
 from clamber.execution.simulation import has_fallen, simulate
-from clamber.execution.unintended import RETREATS, UnintendedContact
+from clamber.execution.unintended import LASTS, RETREATS, UnintendedContact
 from clamber.execution.verdict import END_SPEED, Figure, judge
 from clamber.model.kinematics import Kinematics
+from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_yaw, quat_multiply
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.planner import timed
@@ -451,7 +452,7 @@ def nothing_found(monkeypatch):
         asked.append(start)
         raise InputError("no way")
 
-    monkeypatch.setattr(executive, "plan", nothing)
+    monkeypatch.setattr(progress, "plan", nothing)
     return asked
 
 
@@ -552,7 +553,7 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
             complete=False,
             trajectory=timed(hands_plan.world, changes or hands_plan.changes, "max"),
         )
-        monkeypatch.setattr(executive, "plan", lambda *_, found=found, **__: found)
+        monkeypatch.setattr(progress, "plan", lambda *_, found=found, **__: found)
         told, touch = Told(hands_plan), touch_of(hands_plan, 0)
         told.to(touch - 100)
         told.up = 1.1 * FALLBACK
@@ -582,7 +583,7 @@ def test_a_policy_followed_anew_reaches_the_keyframes_of_the_plan(
     changes = numbered([hands_plan.changes[i] for i in again])
     t = timed(made.world, changes, "max")
     found = replace(made, start=made.keyframes[1], changes=changes, trajectory=t)
-    monkeypatch.setattr(executive, "plan", lambda *_, **__: found)
+    monkeypatch.setattr(progress, "plan", lambda *_, **__: found)
     told, touch = Told(made), touch_of(made, 0)
     told.to(touch - 100)
     told.up = 1.1 * FALLBACK
@@ -673,6 +674,45 @@ def test_ankles_position_themselves_while_both_arms_are_loaded(fast_plan):
     assert holds(lifts - 200) == {"LFoot": True, "RFoot": False}  # before it steps
 
 
+# A limb that slips back.
+
+
+@pytest.mark.parametrize("at", ["swing", "end"])
+def test_a_limb_that_bears_on_another_support_is_planned_on_from_there(
+    demo_plan, nothing_found, monkeypatch, at
+):
+    """The left knee bears nothing; its foot does, on the ground, for a while.
+
+    It has slipped while the right knee is on its way, or when all is done.
+    """
+    monkeypatch.setattr(executive.Estimate, "_bears", bears_somewhere)
+    end = demo_plan.trajectory.segments[-1].begin
+    told = Told(demo_plan)
+    told.to(touch_of(demo_plan, 5) - 600 if at == "swing" else end)
+    assert told.events == []
+    since, told.moves = told.executive.core.steps, False
+    knee, foot = (told.surfaces.index(x) for x in ("LKnee", "LFoot"))
+    for _ in range(2000):
+        force = told.scales()
+        force[foot], force[knee] = force[knee].copy(), 0.0
+        told.tick(force=force)
+        if nothing_found:
+            break
+    moved = told.events[0]
+    assert kinds(told.events[:1]) == [ContactMoved]
+    assert (moved.surface, moved.planned) == ("LFoot", "LKnee")
+    waited = moved.time - since * PHYSICS_STEP - 0.12  # until the forces are known
+    assert waited == pytest.approx(LASTS if at == "swing" else LOOK - 0.12, abs=0.06)
+    on = {c.surface: c.support for c in nothing_found[0].stance}
+    right = {"RKnee": "box"} if at == "end" else {}
+    assert on == {"LElbow": "box", "RElbow": "box", "LFoot": "ground", **right}
+
+
+def bears_somewhere(estimate, c) -> bool:
+    """Feet on the ground, the rest on the box: a robot of thin air stays in the air."""
+    return estimate.force(c) >= TOUCH and ("Foot" in c.surface) == (c.support == GROUND)
+
+
 # Unintended contacts.
 
 
@@ -705,16 +745,25 @@ def test_a_limb_on_its_way_may_graze_an_edge(
         assert list(told.executive.watch.clearance.values()) == [pytest.approx(0.03)]
 
 
+@pytest.mark.parametrize("before", [True, False])
 def test_on_the_way_to_where_a_change_begins_an_unintended_contact_may_end(
-    demo_plan, nothing_found, arm_on_box
+    demo_plan, nothing_found, arm_on_box, monkeypatch, before
 ):
-    """There a new plan lifts off what touched; back would be where it did."""
+    """There a new plan lifts off what touched; back would be where it did.
+
+    One that was not there before comes on the way.
+    """
     t = demo_plan.trajectory
     later = replace(t, keyframes=np.array([0.8, *t.keyframes[1:]]))
     told = Told(replace(demo_plan, trajectory=later))
+    if before:
+        monkeypatch.setattr(unintended.Watch, "seems_so", True)
     told.to(301)
     told.to(800, share=0.8)
-    assert told.events == []
+    assert kinds(told.events) == ([] if before else [Unintended])
+    if not before:
+        assert told.events[0].time == pytest.approx(0.3 + LASTS, abs=0.05)
+        return
     told.to(900, share=0.8)
     assert kinds(told.events) == [Unintended]
 
@@ -747,7 +796,7 @@ def test_where_there_is_no_way_without_it_it_is_accepted(
         def again():
             return replace(demo_plan, trajectory=replace(demo_plan.trajectory))
 
-        monkeypatch.setattr(executive, "plan", lambda *_, **__: again())
+        monkeypatch.setattr(progress, "plan", lambda *_, **__: again())
     told = Told(demo_plan)
     told.to(500)
     told.moves = False

@@ -8,7 +8,8 @@ import pytest
 from clamber import _core
 from clamber.execution.balance import SMOOTHING
 from clamber.execution.estimate import TOUCH, Estimate
-from clamber.execution.executive import LOOK_STRIDE, Executive, OpenLoop
+from clamber.execution.executive import Executive
+from clamber.execution.open_loop import LOOK_STRIDE, OpenLoop
 from clamber.execution.sensors import Measurement
 from clamber.execution.servo import joint_servo
 from clamber.model.world import PHYSICS_STEP

@@ -718,6 +718,27 @@ def test_far_enough_or_over_a_smooth_box_nothing_is_asked_for(rough, box, height
     np.testing.assert_allclose(qp.H, DAMPING * np.eye(w.model.nv))
 
 
+@pytest.mark.parametrize(("roughness", "asked"), [(0.03, True), (0.015, False)])
+def test_a_hand_beside_its_elbow_keeps_apart_from_an_uneven_top(
+    world, roughness, asked
+):
+    """It is on the elbow's link, and would touch a higher part of the top first."""
+    boxes = tuple(replace(b, roughness=roughness) for b in world.scene.boxes)
+    ik = IK(build_world(world.robot, replace(world.scene, boxes=boxes)))
+    w = ik.world
+    assert w.surfaces["LHand"].body == w.surfaces["LElbow"].body
+    q = hand_over(ik, "yawed", 0.012)
+    elbow, clearance = task_at(ik, q, "LElbow", "yawed"), only(w, "LHand", 0.01)
+    alone = ik.build(problem_of(w, clearance=clearance), q).merit
+    beside = ik.build(problem_of(w, elbow, clearance=clearance), q).merit
+    assert alone > 0.0
+    assert beside == pytest.approx(alone if asked else 0.0)
+    # Never the geoms of the surface itself.
+    own = only(w, "LElbow_forearm", 0.004)
+    assert ik.build(problem_of(w, clearance=own), q).merit > 0.0
+    assert ik.build(problem_of(w, elbow, clearance=own), q).merit == pytest.approx(0.0)
+
+
 def test_a_pair_within_range_that_is_far_enough_has_no_part_in_it(rough):
     """The link's next geom, nearer than the hand should be, but not than it should."""
     w = rough.world

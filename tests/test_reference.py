@@ -164,11 +164,29 @@ def test_aside_goes_until_something_happens_or_there_and_back(ref, hands_plan, f
         t, **{n: getattr(t, n)[900:1000] for n in ("time", "q", "v", "tau", "contact")}
     )
     exhaust(ref, ref.play(900))
-    ticks = exhaust(ref, ref.aside(way, lambda: found and ref.q[0] == way.q[59][0]))
+    ticks = exhaust(
+        ref, ref.aside(way, lambda: found and ref.q[0] == way.q[59][0], lambda: False)
+    )
     assert ticks == (60 if found else 200)
     assert np.array_equal(ref.q, way.q[59 if found else 0])
     assert ref.i == 900  # the trajectory is where it was left
     assert ref.left_plan
+
+
+def test_aside_is_left_at_once_where_something_else_happens(ref, hands_plan):
+    """Back over what was done, no farther."""
+    t = hands_plan.trajectory
+    way = replace(
+        t, **{n: getattr(t, n)[900:1000] for n in ("time", "q", "v", "tau", "contact")}
+    )
+    exhaust(ref, ref.play(900))
+    went = []
+    gen = ref.aside(way, lambda: False, lambda: bool(ref.q[0] == way.q[59][0]))
+    for _ in steps(ref, gen):
+        went.append(ref.q.copy())
+    assert len(went) == 120
+    assert np.array_equal(went[60:], went[59::-1])
+    assert np.array_equal(ref.q, way.q[0])
 
 
 def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
@@ -187,7 +205,7 @@ def test_the_way_back_to_a_trajectory_is_smooth_and_its_rate_its_derivative(
         contact=t.contact[i][None],
     )
     exhaust(ref, ref.play(i))
-    next(steps(ref, ref.aside(away, lambda: False)))
+    next(steps(ref, ref.aside(away, lambda: False, lambda: False)))
     ref.resume()
     rows = []
     start = ref.q.copy()

@@ -172,7 +172,7 @@ def test_each_limb_leaves_the_surface_that_it_is_on(demo_plan):
     other = tuple(
         replace(c, surface="LElbow") if c.surface == "LHand" else c for c in key.stance
     )
-    new = from_here(steps[2:], other, world)
+    new = from_here(steps, 2, other, world)
     assert [s.breaks for s in steps[2:]] == [
         ("LHand",),
         ("RHand",),
@@ -197,11 +197,34 @@ def test_only_the_first_move_of_a_limb_is_another(demo_plan):
     on = demo_plan.keyframes[1].stance
     other = tuple(replace(c, surface="LElbow") for c in on if c.surface == "LHand")
     later = hand[-1]
-    new = from_here([later, later], other, world)
+    new = from_here([later, later], 0, other, world)
     assert [s.breaks for s in new] == [("LElbow",), later.breaks]
     # One that should be in the air, and is not, lets go of what it is on.
-    (air,) = from_here([hand[0]], other, world)
+    (air,) = from_here([hand[0]], 0, other, world)
     assert (hand[0].breaks, air.breaks) == ((), ("LElbow",))
+
+
+def test_a_limb_that_is_back_on_the_ground_has_its_step_left(demo_plan):
+    """A knee has slipped off the box: first of all its foot leaves the ground again."""
+    world = demo_plan.world
+    steps = split_steps(demo_plan.sequence, world)[0]
+    n = len(steps)
+    foot = demo_plan.start.stance[0]
+    assert (foot.surface, foot.support) == ("LFoot", "ground")
+    end = demo_plan.keyframes[-1].stance
+    slipped = (foot, *(c for c in end if c.surface != "LKnee"))
+    assert from_here(steps, n, end, world) == []
+    (again,) = from_here(steps, n, slipped, world)
+    assert (again.limb, again.breaks) == ("left_leg", ("LFoot",))
+    assert again.makes is steps[-2].makes
+    assert again.makes.surface == "LKnee"
+    # Another step that is still to come is planned after it.
+    left = from_here(steps, n - 1, slipped, world)
+    assert [s.makes.surface for s in left] == ["LKnee", "RKnee"]
+    # On another surface, or in the air, it is where it is.
+    other = [replace(c, surface="LFoot") if c.surface == "LKnee" else c for c in end]
+    assert from_here(steps, n, other, world) == []
+    assert from_here(steps, n, slipped[1:], world) == []
 
 
 # What is left, from a stance as it was measured.

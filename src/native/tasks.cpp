@@ -1,10 +1,24 @@
 #include "tasks.h"
 
+#include <algorithm>
+
 namespace clamber {
 
 namespace {
 
+constexpr double UNEVEN = 0.02;  // [m] more than what is kept from a top that was measured
 const Vec3 UNIT[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+
+// Whether a pair is as near as a contact is: that of its surface; over a support that is
+// hardly uneven, of its whole link. Elsewhere what is beside the surface touches first.
+bool is_at_contact(const Model& model, int pair, const SurfaceTask& t, bool uneven) {
+    for (const auto& own : model.touching[t.surface][t.support])
+        if (std::find(own.begin(), own.end(), pair) != own.end()) return true;
+    const auto [a, b] = model.pairs[pair];
+    const int support = model.supports[t.support].geom, body = model.surfaces[t.surface].body;
+    if (uneven || (a != support && b != support)) return false;
+    return model.geoms[a].body == body || model.geoms[b].body == body;
+}
 
 }  // namespace
 
@@ -29,17 +43,10 @@ void Rows::ask(const Problem& problem) {
     apart_reach_ = 0.0;
     for (std::size_t i = 0; i < n; ++i) {
         if (!counts[i] || !(rough[i] > 0.0)) continue;
-        // Links in contact with their supports are as near as their contact is: of
-        // those, only what was told keeps apart.
-        bool touching = false;
-        for (const SurfaceTask& t : problem.tasks) {
-            if (t.kind == TaskKind::Reaching || told[i]) continue;
-            const int body = model_.surfaces[t.surface].body;
-            const int geom = model_.supports[t.support].geom;
-            const auto [a, b] = model_.pairs[i];
-            const bool link = model_.geoms[a].body == body || model_.geoms[b].body == body;
-            touching = touching || (link && (a == geom || b == geom));
-        }
+        bool touching = false;  // what was told keeps apart all the same
+        for (const SurfaceTask& t : problem.tasks)
+            touching = touching || (t.kind != TaskKind::Reaching && !told[i] &&
+                                    is_at_contact(model_, int(i), t, rough[i] > UNEVEN));
         if (touching) continue;
         apart_[i] = 1;
         apart_reach_ = std::max(apart_reach_, problem.clearance[i] + rough[i]);

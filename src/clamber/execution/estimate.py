@@ -109,34 +109,46 @@ class Estimate:
         up, side = self.deviation(c)
         return side < NEAR and abs(up) < DEVIATION
 
-    def substitute(self, c: Contact) -> Contact | None:
-        """The contact of another surface of the limb that is loaded in place of `c`."""
+    def substitute(self, c: Contact, *, there: bool = False) -> Contact | None:
+        """The contact of another surface of the limb that is loaded in place of `c`.
+
+        On the same support; or, if it need not be `there`, on another: a foot that is
+        back on the ground.
+        """
         if self.force(c) >= LOST:
             return None
-        support = self.world.supports[c.support]
+        others = () if there else self.world.supports.keys() - {c.support}
         for surface in self.world.robot.limb_of(c.surface).surfaces:
-            other = replace(c, surface=surface, edge=None, link=None)
-            if surface != c.surface and self.force(other) >= TOUCH:
-                p = self.point(other)
-                there = support.inside(p) and abs(support.height(p)) < REACH
-                if there and self._lies(surface, support.normal):
-                    return replace(other, position=p)
+            for support in (c.support, *sorted(others)):
+                other = replace(
+                    c, surface=surface, support=support, edge=None, link=None
+                )
+                if surface != c.surface and self._bears(other):
+                    if support != c.support or self._lies(other):
+                        return replace(other, position=self.point(other))
         return None
+
+    def _bears(self, c: Contact) -> bool:
+        """Whether a surface is loaded over that support."""
+        if self.force(c) < TOUCH:
+            return False
+        p, support = self.point(c), self.world.supports[c.support]
+        return bool(support.inside(p)) and abs(support.height(p)) < REACH
 
     def is_lost(self, c: Contact) -> bool:
         """Neither the contact's surface nor another one of the limb is loaded."""
         return self.force(c) < LOST and self.substitute(c) is None
 
-    def _lies(self, surface: str, normal: np.ndarray) -> bool:
-        """Whether a surface lies on a support rather than touching with a corner.
+    def _lies(self, c: Contact) -> bool:
+        """Whether a surface lies on its support rather than touching with a corner.
 
         Only then its middle is where the support is. The kinematics are up to date.
         """
-        s = self.world.surfaces[surface]
+        s = self.world.surfaces[c.surface]
         if s.rotation is None:
             return True
         up = (self.kin.rotation(s.body) @ s.rotation)[:, 2]
-        return float(up @ normal) > math.cos(TILTED)
+        return float(up @ self.world.supports[c.support].normal) > math.cos(TILTED)
 
     def measured(self, c: Contact) -> Contact:
         """The contact where it is."""

@@ -24,12 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.contact.steps import split_steps
-from clamber.errors import InputError, Status
-from clamber.execution.balance import SMOOTHING, Balance
-from clamber.execution.estimate import DEVIATION, LOST, PRESSED, TOUCH, Estimate
+from clamber.execution.balance import Balance
+from clamber.execution.estimate import DEVIATION, LOST, PRESSED, Estimate
 from clamber.execution.events import (
     ContactMoved,
     Event,
@@ -45,22 +43,26 @@ from clamber.execution.events import (
     Stopped,
     Unintended,
 )
+from clamber.execution.open_loop import LOOK_STRIDE, follower
 from clamber.execution.probe import REACH, guarded_move
-from clamber.execution.progress import AtHand, Span, nearest_keyframe
+from clamber.execution.progress import (
+    FALLBACK,
+    AtHand,
+    Span,
+    nearest_keyframe,
+    rest_of,
+)
 from clamber.execution.reference import Actions, Reference
 from clamber.execution.sensors import Measurement
-from clamber.execution.servo import joint_servo, self_positioning
-from clamber.execution.unintended import Watch
+from clamber.execution.servo import self_positioning
+from clamber.execution.terrain import CAUTION
+from clamber.execution.unintended import LASTS, Watch
 from clamber.model.progress import Progress, silent
-from clamber.model.scene import Scene
 from clamber.model.se3 import wrap, yaw_of
 from clamber.model.world import PHYSICS_STEP, World, limb_links
-from clamber.planning.planner import plan
-from clamber.planning.records import Budget, Plan, State
+from clamber.planning.records import Plan, State
 from clamber.planning.trajectory import HOLD_END, HOLD_START, Trajectory
-from clamber.step.change import Failure
-from clamber.step.ik import NO_EXTRA, ExtraClearance
-from clamber.step.posture import Keyframe
+from clamber.step.ik import NO_EXTRA
 
 DRIFT = 0.015  # [m] along the support: the rest is planned again
 START_DRIFT = 0.010  # [m] of the start, as far as the arms reach
@@ -71,63 +73,11 @@ THINKING = 0.1  # [s] the robot stands still while the rest is planned again
 SEARCHING = 1.0  # [s] ... where other contacts are looked for
 PAUSE = 10.0  # [s] that it stands where it is told to pause
 FEEL = 0.05  # [s] later than planned that a contact may be felt
-HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
-FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
-LOOK_STRIDE = 10  # physics steps between two looks at that, and at the balance
-PART = 10_000  # samples that are followed open loop, before the next ones are made
 SEARCHES = 4  # as often another place is looked for, where a contact is not found
 FIRST = round(HOLD_START / PHYSICS_STEP) - 1  # sample from which a trajectory moves
 
 # Of a reaction: whether there was something to react to.
 Reaction = Generator[None, None, bool]
-
-
-class OpenLoop:
-    """The trajectory as it is, sample by sample.
-
-    Attributes:
-        core: What is done at every physics step.
-    """
-
-    def __init__(self, plan: Plan, world: World) -> None:
-        """Follow `plan` on the servos of `world`."""
-        assert plan.trajectory is not None
-        t = plan.trajectory
-        self._last = len(t.time) - 1
-        self._ref = Reference(t, world)
-        self._ref.follow(t, -1)
-        filter_ = Estimate(plan.world, t.q[0]).filter
-        held = self_positioning(world, "max")  # no ankle follows what is measured
-        self.core = _follower(world, filter_, self._ref, held)
-        self.events: list[Event] = []
-        self.followed: Trajectory | None = None
-        final = plan.keyframes[-1].stance
-        self.rests_on = tuple(f"{c.surface}@{c.support}" for c in final)
-
-    def command(self, measured: Measurement) -> np.ndarray:
-        """(na,) servo command of the next physics step."""
-        return self.core.command(measured.q, measured.force, self)
-
-    def decide(self, look: bool) -> None:
-        """Go on with the next part of the trajectory, if it is time."""
-        del look
-        if self._ref.track.left == 0:
-            end = min(self._ref.i + PART, self._last)
-            self.core.ends = self._last - end < PART
-            next(self._ref.play(self._last if self.core.ends else end))
-
-    def balance(self) -> None:
-        """Nothing is measured."""
-
-    @property
-    def reference(self) -> np.ndarray:
-        """(nq,) of the last command."""
-        return self._ref.q
-
-    @property
-    def left(self) -> int:
-        """Physics steps to the end."""
-        return self._last - self._ref.i
 
 
 class Executive:
@@ -167,6 +117,7 @@ class Executive:
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
         self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
         self._searches, self._pause = 0, pause
+        self._back = 0.0  # [s] that a limb has been back on another support
         self.done = 0 if plan.state is None else plan.state.done
         # A policy reads what comes next off the stance: it has no steps to count.
         by_policy = plan.policy is not None
@@ -180,7 +131,7 @@ class Executive:
         self.estimate = Estimate(plan.world, plan.trajectory.q[0])
         self._ref = Reference(plan.trajectory, plan.world)
         ankles = self_positioning(world, plan.options.speed)
-        self.core = _follower(world, self.estimate.filter, self._ref, ankles)
+        self.core = follower(world, self.estimate.filter, self._ref, ankles)
         self._adopt(plan, plan.trajectory, 0)
         self._behaviour = self._behave()
 
@@ -192,6 +143,9 @@ class Executive:
         """What to follow next; `look` once every `LOOK_STRIDE` steps."""
         if look:
             self.watch.look(self.estimate.load, self._in_use)
+            actual = ((c, self._actual(c)) for c in self._bearing)
+            back = any(c.support != x.support for c, x in actual)
+            self._back = self._back + LOOK_STRIDE * PHYSICS_STEP if back else 0.0
             if (
                 self._pause is not None
                 and self.core.steps * PHYSICS_STEP >= self._pause
@@ -259,7 +213,7 @@ class Executive:
                 yield from self._make_change(at_hand.spans[at_hand.change])
             elif at_hand.goes_on:
                 yield from self._go_ahead()
-            elif not (yield from self._retreat_from_here()):
+            elif not (yield from self._check_end()):
                 break
         if self._at_hand.failure and not self.stopped:
             self._stop(self._at_hand.failure)
@@ -272,30 +226,48 @@ class Executive:
         """One contact change: shift, swing, touch, settle."""
         if span.makes is not None and (yield from self._make(span, span.makes)):
             return
-        yield from self._ref.play(span.end, until=self._is_unintended)
+        yield from self._ref.play(span.end, until=self._is_wrong)
         self._count_change()
         if self.watch.found is not None:
             yield from self._retreat(span.touch, span.makes)
+            return
+        if self._is_back():
+            yield from self._go_on_from_here()
             return
         loaded = [c for c in self.stance if self.estimate.force(c) >= LOST]
         self.estimate.remember(loaded, self.done)
         yield from self._check_stance()
 
+    def _settle(self, to: int) -> Reaction:
+        """The way from where planning again began to its first posture.
+
+        It may be what ends an unintended contact; one that comes on the way is new.
+        """
+        until = None if self.watch.seems_so else self._is_unintended
+        yield from self._ref.play(to, until)
+        if self.watch.found is None:
+            return False
+        yield from self._retreat(FIRST)
+        return True
+
     def _make(self, span: Span, c: Contact) -> Reaction:
         """Close a contact; false where that went as planned."""
         ref, touches = self._ref, self.estimate.touches
-        # The way to where the change begins may be what ends an unintended contact.
-        yield from ref.play(span.begin + 1)
+        if (yield from self._settle(span.begin + 1)):
+            return True
         near = (span.swing + span.touch) // 2 + 1
-        yield from ref.play(near, until=self._is_unintended)
-        if self.watch.found is None:
+        yield from ref.play(near, until=self._is_wrong)
+        if self.watch.found is None and not self._is_back():
             self.estimate.expect(c)
             yield from ref.play(
-                span.touch, until=lambda: touches(c) or self._is_unintended()
+                span.touch, until=lambda: touches(c) or self._is_wrong()
             )
             self.estimate.expect()
         if self.watch.found is not None:
             yield from self._retreat(span.begin)
+            return True
+        if self._is_back():
+            yield from self._go_on_from_here()
             return True
         if ref.i < span.touch and self.estimate.deviation(c)[0] > DEVIATION:
             yield from self._take(c, c)
@@ -315,7 +287,11 @@ class Executive:
             return False
         yield from ref.back(span.touch)  # where the others hold the robot
         found = yield from self._probe(c)
-        if found is None:
+        if self.watch.found is not None:
+            yield from self._retreat(span.begin)
+        elif self._is_back():
+            yield from self._go_on_from_here()
+        elif found is None:
             yield from self._seek(c)
         elif found is not c or abs(self.estimate.deviation(c)[0]) > DEVIATION:
             yield from self._take(found, c)
@@ -328,7 +304,7 @@ class Executive:
         """What was planned ahead of a policy has been done: the next steps of it."""
         key = self._at_hand.keyframes[-1]
         scene, clearance = self.estimate.world.scene, self.watch.clearance
-        found = _rest(self._plan, scene, key, 0.0, clearance, self._report)
+        found = rest_of(self._plan, scene, key, 0.0, clearance, self._report)
         if found.trajectory is None:
             self._at_hand.goes_on = False
             if found.failures:
@@ -360,7 +336,7 @@ class Executive:
             return
         self._note(StartsElsewhere, distance=away, yaw=yaw)
         scene = replace(world.scene, start=np.array([*xy, theta + yaw]))
-        found = _rest(self._plan, scene, None, off, NO_EXTRA, self._report)
+        found = rest_of(self._plan, scene, None, off, NO_EXTRA, self._report)
         yield from self._ref.rest(THINKING)
         yield from self._follow(found, off)
 
@@ -375,6 +351,16 @@ class Executive:
         for react in (self._retreat_from_here, self._recover, self._accept):
             if (yield from react()):
                 return
+
+    def _check_end(self) -> Reaction:
+        """At the last keyframe: is there still something to do?"""
+        yield from self._ref.hold(LOOK)
+        if (yield from self._retreat_from_here()):
+            return True
+        if any(self._actual(c).support != c.support for c in self.stance):
+            yield from self._go_on_from_here()
+            return True
+        return False
 
     def _is_off(self) -> bool:
         """Is something unintended loaded, or a contact lost or elsewhere?"""
@@ -401,7 +387,7 @@ class Executive:
     def _end(self) -> Actions:
         """Hold the last posture."""
         self.core.ends = True
-        yield from self._ref.hold(HOLD_END)
+        yield from self._ref.hold(HOLD_END - (0.0 if self.stopped else LOOK))
 
     # How it reacts.
 
@@ -461,6 +447,9 @@ class Executive:
             self._note(Lost, surface=c.surface)
             others = [x for x in self.stance if x is not c]
             found = yield from self._probe(c)
+            if self.watch.found is not None:
+                yield from self._retreat(self._ref.i)
+                return True
             if found is None:
                 self._note(GivenUp, surface=c.surface)
                 yield from self._replan(others, others)
@@ -481,6 +470,20 @@ class Executive:
                 return True
         return False
 
+    def _go_on_from_here(self) -> Actions:
+        """A limb has slipped back to another support: on from the stance as it is."""
+        self._back = 0.0
+        if self._searches == SEARCHES:
+            self._stop("a contact slips off its support again and again")
+            return
+        self._searches += 1
+        held = {c: self._actual(c) for c in self._bearing}
+        for planned, c in held.items():
+            if c is not planned:
+                self._note_moved(c, planned, made=False)
+        actual = tuple(held.values())
+        yield from self._replan(actual, actual)
+
     def _probe(self, c: Contact) -> Generator[None, None, Contact | None]:
         """Go on along the normal; returns the contact that is found, or None.
 
@@ -498,13 +501,14 @@ class Executive:
 
         def touches() -> bool:
             nonlocal found
-            found = c if estimate.touches(c, REACH) else estimate.substitute(c)
+            touches = estimate.touches(c, REACH)
+            found = c if touches else estimate.substitute(c, there=True)
             return found is not None
 
         if t is not None:
             limb = self._plan.world.robot.limb_of(c.surface)
             estimate.expect(*(replace(c, surface=s) for s in limb.surfaces))
-            yield from ref.aside(t, touches)
+            yield from ref.aside(t, touches, self._is_wrong)
             estimate.expect()
         return found
 
@@ -514,9 +518,13 @@ class Executive:
         """Take the stance as it is and plan the remaining steps again."""
         yield from self._stand()
         estimate = self.estimate
-        off = max(max(abs(u), s) for u, s in map(estimate.deviation, contacts))
-        if len(contacts) < len(self.stance):
-            off = np.inf  # without a contact there is no going on as planned
+        actual = {c: self._actual(c) if c in loaded else c for c in contacts}
+        loaded = [actual[c] for c in loaded]
+        contacts = tuple(actual.values())
+        moved = (max(abs(u), s) for u, s in map(estimate.deviation, contacts))
+        off = max(moved, default=np.inf)
+        if _places(contacts) != _places(self.stance):
+            off = np.inf  # then there is no going on as planned
         estimate.remember(contacts, self.done)
         q = self.reference.copy()  # joints as commanded, base as measured
         q[:7] = estimate.q[:7]
@@ -529,7 +537,7 @@ class Executive:
         )
         scene = estimate.scene(self._plan.world.scene)
         clearance = self.watch.clearance
-        found = _rest(self._plan, scene, now, off, clearance, self._report)
+        found = rest_of(self._plan, scene, now, off, clearance, self._report)
         yield from self._ref.rest(THINKING if off < FALLBACK else SEARCHING)
         yield from self._follow(found, off)
 
@@ -548,7 +556,7 @@ class Executive:
         self._adopt(found, found.trajectory, FIRST)
         if changes == 0 and not self._at_hand.goes_on:
             # There is still the way to the last posture.
-            yield from self._ref.play(found.trajectory.segments[-1].begin - 1)
+            yield from self._settle(found.trajectory.segments[-1].begin - 1)
 
     def _keep_plan(self, off: float, why: str) -> Actions:
         """No other plan was found: the one at hand may do, or may not."""
@@ -573,6 +581,10 @@ class Executive:
 
     def _adopt(self, plan: Plan, trajectory: Trajectory, sample: int) -> None:
         self.estimate.believe(plan.world)
+        scene = plan.world.scene
+        self.watch.alert = any(
+            x.roughness > CAUTION for x in (*scene.boxes, *scene.meshes)
+        )
         self._ref.follow(trajectory, sample)
         self._at_hand = AtHand(plan, trajectory)
         self._bearing: list[Contact] = []  # contacts that are closed
@@ -593,7 +605,8 @@ class Executive:
         at_hand.change += 1
         n: int | None = len(self._reached)
         if made.step.index is not None:
-            self.done = made.step.index + 1
+            done = made.step.index + 1
+            self.done = max(self.done, done) if self._steps else done
             n = self.done - self._begun  # one that is made again counts once
         if self._plan.policy is not None and at_hand.plan is not self._plan:
             # Its steps are numbered anew, and there may be more or fewer of them.
@@ -613,6 +626,14 @@ class Executive:
             used.update(self._plan.world.robot.limb_of(makes.surface).surfaces)
         return used
 
+    def _is_wrong(self) -> bool:
+        """Is a link loaded that should not be, or a limb back on another support?"""
+        return self._is_unintended() or self._is_back()
+
+    def _is_back(self) -> bool:
+        """Has a limb that was in contact come down on another support?"""
+        return self._back >= LASTS
+
     def _is_unintended(self) -> bool:
         """Is a link loaded where it should not be? Then `watch` has found it."""
         if not self.watch.is_due:
@@ -625,61 +646,9 @@ class Executive:
         return self.watch.find(self.estimate.kin, load, self._in_use, moving)
 
 
-def _follower(
-    world: World, filter_: _core.Filter, ref: Reference, ankles: _core.SelfPositioning
-) -> _core.Follower:
-    """What follows a reference on the servos of a world."""
-    return _core.Follower(
-        filter_,
-        ref.track,
-        joint_servo(world),
-        ankles,
-        qadr=world.qadr.tolist(),
-        period=LOOK_STRIDE,
-        touch=TOUCH,
-        shift_share=PHYSICS_STEP / SMOOTHING,
-    )
-
-
-def _rest(
-    made: Plan,
-    scene: Scene,
-    start: State | Keyframe | None,
-    off: float,
-    clearance: ExtraClearance,
-    report: Progress,
-) -> Plan:
-    """What is left to do of a plan, in the scene as it is believed to be.
-
-    Where contacts are so far `off` that the plan at hand will not do, other ones than
-    the demonstrated may. Where nothing robust is left to do, it need not be.
-    """
-    options = made.options
-    try:
-        found = plan(
-            made.policy or made.sequence,
-            made.world.robot,
-            scene,
-            start=start,
-            options=options,
-            contacts="any" if off >= FALLBACK else "demonstrated",
-            budget=Budget(ahead=HORIZON),
-            clearance=clearance,
-            progress=lambda stage, done, note: report(
-                stage, done, f"planning again: {note}"
-            ),
-        )
-        if not (options.robust and found.failures):
-            return found
-        keyframe = replace(options.keyframe, robust=False)
-        usual = replace(options, robust=False, keyframe=keyframe)
-        made = replace(made, options=usual)
-        return _rest(made, scene, start, off, clearance, report)
-    except InputError as e:
-        failure = Failure(status=Status.UNREACHABLE, detail=str(e))
-        return replace(
-            made, changes=(), failures=(failure,), trajectory=None, complete=False
-        )
+def _places(stance: Sequence[Contact]) -> set[tuple[str, str]]:
+    """Which surface is on which support."""
+    return {(c.surface, c.support) for c in stance}
 
 
 def _resting(estimate: Estimate, stance: Sequence[Contact]) -> Iterable[str]:

@@ -1,18 +1,26 @@
-"""The plan at hand, and how far it has come: its contact changes in samples."""
+"""The plan at hand: its contact changes in samples, and what is left of it."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from clamber.contact.contact import Contact
+from clamber.errors import InputError, Status
+from clamber.model.progress import Progress
 from clamber.model.records import short_repr
-from clamber.planning.records import Plan
+from clamber.model.scene import Scene
+from clamber.planning.planner import plan
+from clamber.planning.records import Budget, Plan, State
 from clamber.planning.trajectory import Trajectory
-from clamber.step.change import Change
+from clamber.step.change import Change, Failure
+from clamber.step.ik import ExtraClearance
 from clamber.step.posture import Keyframe
+
+HORIZON = 6  # contact changes that a policy is followed ahead, before it goes on
+FALLBACK = 0.035  # [m] a deviation that the plan at hand may survive as it is
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,6 +85,47 @@ class AtHand:
         """Those whose surfaces, of nS in order, are in contact: (nS,) bool."""
         row = surfaces.index
         return [c for s, c in self.near_contacts().items() if closed[row(s)]]
+
+
+def rest_of(
+    made: Plan,
+    scene: Scene,
+    start: State | Keyframe | None,
+    off: float,
+    clearance: ExtraClearance,
+    report: Progress,
+) -> Plan:
+    """What is left to do of a plan, in the scene as it is believed to be.
+
+    Where contacts are so far `off` that the plan at hand will not do, other ones than
+    the demonstrated may. Where nothing robust is left to do, it need not be.
+    """
+    options = made.options
+    try:
+        found = plan(
+            made.policy or made.sequence,
+            made.world.robot,
+            scene,
+            start=start,
+            options=options,
+            contacts="any" if off >= FALLBACK else "demonstrated",
+            budget=Budget(ahead=HORIZON),
+            clearance=clearance,
+            progress=lambda stage, done, note: report(
+                stage, done, f"planning again: {note}"
+            ),
+        )
+        if not (options.robust and found.failures):
+            return found
+        keyframe = replace(options.keyframe, robust=False)
+        usual = replace(options, robust=False, keyframe=keyframe)
+        made = replace(made, options=usual)
+        return rest_of(made, scene, start, off, clearance, report)
+    except InputError as e:
+        failure = Failure(status=Status.UNREACHABLE, detail=str(e))
+        return replace(
+            made, changes=(), failures=(failure,), trajectory=None, complete=False
+        )
 
 
 def nearest_keyframe(plan: Plan, made: Change, *, begin: int) -> int | None:

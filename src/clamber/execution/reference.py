@@ -167,15 +167,22 @@ class Reference:
             yield from self._done()
             self._rate = np.zeros(0)
 
-    def aside(self, t: Trajectory, until: Callable[[], bool]) -> Actions:
-        """Follow another trajectory until something happens, or there and back."""
+    def aside(
+        self, t: Trajectory, until: Callable[[], bool], unless: Callable[[], bool]
+    ) -> Actions:
+        """Follow another trajectory until something happens, or there and back.
+
+        Back at once where something else does.
+        """
         self.left_plan = True
         self._load(t, slice(None))
         for _ in self._done():
             yield
             if until():
                 return
-        self._load(t, slice(None), back=True)
+            if unless():
+                break
+        self._load(t, slice(self.track.done), back=True)
         yield from self._done()
 
     def rest(self, seconds: float) -> Actions:

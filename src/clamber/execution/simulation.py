@@ -15,7 +15,8 @@ from clamber import _core
 from clamber.errors import InputError
 from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Event, Stopped
-from clamber.execution.executive import Executive, OpenLoop
+from clamber.execution.executive import Executive
+from clamber.execution.open_loop import OpenLoop
 from clamber.execution.perturbed import perturbed_world, push_of
 from clamber.execution.reference import STEPS
 from clamber.execution.sensors import BLOCK, Sensors

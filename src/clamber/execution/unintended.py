@@ -20,12 +20,15 @@ import numpy as np
 
 from clamber import _core
 from clamber.model.kinematics import Kinematics
+from clamber.model.scene import GROUND
 
 MISSING = 0.08  # of the weight that the surfaces do not carry
 SIDEWAYS = 15.0  # [N] and more than the force upwards: a surface hits a side
 SEARCHED = 0.06  # [m] a support is believed no farther from what touches it
+KNOWN = 0.015  # [m] ... and the ground, which is known
 AWAY = 0.20  # [m] from the line of the force, besides what soles leave open
 LASTS = 0.2  # [s] a link is loaded for so long where it should not be: it is
+ALERT = 0.1  # [s] ... where supports have turned out to be uneven
 CLEARANCE = 0.02  # [m] farther than where an unintended contact was
 RETREATS = 4  # as often another way is looked for
 UP = np.array([0.0, 0.0, 1.0])
@@ -122,6 +125,8 @@ def _near_supports(
         first = int(of_support[k, 0])  # the robot's is the other one
         geom, other = int(world.pairs[k, first]), int(world.pairs[k, 1 - first])
         support = world.support_of_geom[other]
+        if support == GROUND and distance > KNOWN:
+            continue
         touch = UnintendedContact(geom, support, float(distance))
         out.append((touch, b if first else a))
     return out
@@ -134,11 +139,12 @@ class Watch:
         weight: Of the robot, as measured [N].
         found: What was found last and not taken yet.
         clearance: Extra clearance [m] by geom and support, after those that were found.
+        alert: Supports have turned out to be uneven.
     """
 
     def __init__(self, surfaces: Sequence[str], period: float) -> None:
         """Look at the forces on `surfaces`, in order, every `period` [s]."""
-        self.weight = 0.0
+        self.weight, self.alert = 0.0, False
         self.found: UnintendedContact | None = None
         self.clearance: dict[tuple[int, str], float] = {}
         self._surfaces, self._period = surfaces, period
@@ -159,9 +165,15 @@ class Watch:
             self._lasted = 0.0
 
     @property
+    def seems_so(self) -> bool:
+        """Something seems to be loaded that should not be."""
+        return self._lasted > 0.0
+
+    @property
     def is_due(self) -> bool:
         """It has seemed so for long enough to ask what it is."""
-        return self._lasted >= LASTS and self._taken < RETREATS
+        lasts = self._lasted >= (ALERT if self.alert else LASTS)
+        return lasts and self._taken < RETREATS
 
     def find(
         self,

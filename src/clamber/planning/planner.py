@@ -310,7 +310,7 @@ class _Task:
             if proposer != "demonstrated":
                 done = steps_done(goal, steps, state.stance, world)
                 state = replace(state, done=done)
-            steps, skipped = from_here(steps[state.done :], state.stance, world), []
+            steps, skipped = from_here(steps, state.done, state.stance, world), []
         if self._unsettled:
             route = Route(start=self._start, failures=self._unsettled)
             return self._plan(goal, route, state)

@@ -258,17 +258,26 @@ def _same(a: Contact, b: Contact | None) -> bool:
 
 
 def from_here(
-    steps: Sequence[Step], stance: Sequence[Contact], world: World
+    steps: Sequence[Step], done: int, stance: Sequence[Contact], world: World
 ) -> list[Step]:
-    """The steps, where each limb leaves what it is really on.
+    """The steps that are left, where each limb leaves what it is really on.
 
-    That may be a surface that the steps do without.
+    That may be a surface that the steps do without. Of a limb that is on another
+    support than its last step led to, a foot that has slipped back to the ground, that
+    step is left, too.
     """
-    on = {world.robot.limb_of(c.surface).name: (c.surface,) for c in stance}
-    out = []
-    for step in steps:
-        out.append(replace(step, breaks=on.pop(step.limb, step.breaks)))
-    return out
+    now = {world.robot.limb_of(c.surface).name: c for c in stance}
+    led = {s.limb: s for s in steps[:done] if s.makes is not None}
+    again = [
+        s
+        for limb, s in led.items()
+        if limb in now and s.makes is not None and s.makes.support != now[limb].support
+    ]
+    on = {limb: (c.surface,) for limb, c in now.items()}
+    return [
+        replace(step, breaks=on.pop(step.limb, step.breaks))
+        for step in (*again, *steps[done:])
+    ]
 
 
 def from_standing(
