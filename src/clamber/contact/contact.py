@@ -53,9 +53,9 @@ class Contact:
             `position` is the middle of that edge. None while it lies flat.
         link: (4,) orientation of a round surface's link in the world where it touches
             at `position`; as the link turns, the surface rolls from there. None where
-            the contact is not a robot's posture yet.
-        fixed: A person put it there: the position is no reference but where it is to be
-            planned, or as near as can be reached.
+            no robot's posture belongs to the contact yet.
+        fixed: Set by a user: the contact is planned at this position, or as near to it
+            as the robot can reach; otherwise the position is a reference only.
     """
 
     surface: str
@@ -93,12 +93,12 @@ class Stance:
     """The contacts that hold at once, and the body's posture.
 
     Attributes:
-        contacts: No surface twice.
+        contacts: One for each surface in contact.
         posture: Unit directions (3,) in the world by name, from `DIRECTIONS`; may be
             empty where the demonstration does not say.
-        pelvis: (7,) the pelvis in the world: position [m] and orientation wxyz, of a
-            frame with y to the left hip and z along the trunk; None where the
-            demonstration does not say, and at the robot's scale.
+        pelvis: (7,) pose of the pelvis in the world, position [m] and orientation
+            wxyz; its frame has y to the left hip and z along the trunk. None where the
+            demonstration does not say, and once the sequence is at the robot's scale.
     """
 
     contacts: tuple[Contact, ...]
@@ -141,11 +141,12 @@ class ContactInterval:
     """One contact of one part over time, as detected.
 
     Attributes:
-        part: Of the person, such as `LHand`.
-        is_surface: False of a part that is loaded and is no contact surface: a seat.
-        t0: When it begins [s].
-        t1: When it ends [s].
-        contact: Where it is.
+        part: The person's part, such as `LHand`.
+        is_surface: False for a part that bears load and that no robot has as a
+            contact surface: the seat.
+        t0: Start [s].
+        t1: End [s].
+        contact: Support and pose.
     """
 
     part: str
@@ -162,7 +163,7 @@ class ContactSequence(Shown):
     """Stances in order: what `detect_contacts` finds and `plan` starts from.
 
     Attributes:
-        source: Where it came from, for people.
+        source: Name of the recording or plan that it comes from, for people.
         subject: Segment lengths by name [m]; None for a robot's own plan.
         scene: The scene it was recorded in; positions are in its world.
         stances: N stances.

@@ -51,13 +51,14 @@ _SEGMENTS = {"arm": ("upper_arm", "forearm"), "leg": ("thigh", "shank")}
 
 @checks_types
 def learn_policy(sequences: Sequence[ContactSequence]) -> GeneralPolicy:
-    """Learn the general policy that contact sequences of people have in common.
+    """Learn the general policy that demonstrated contact sequences have in common.
 
     Args:
-        sequences: At the scale of the people who show them.
+        sequences: As detected, at the scale of each person.
 
     Raises:
-        InputError: There is none, one is a robot's own, or shows no repeated cycle.
+        InputError: There is no sequence, or one is a robot's own or shows no repeated
+            cycle.
     """
     return contract_policies([build_demo_policy(s) for s in sequences])
 

@@ -39,12 +39,12 @@ class DemoPolicy:
     """The table of states and actions that a demonstration shows [algorithm 1].
 
     Attributes:
-        source: The demonstration, for people.
-        scene: In whose world the states are.
+        source: Name of the demonstration, for people.
+        scene: The scene it was recorded in; states are in its world.
         subject: Segment lengths of the person by name [m].
-        states: N + 1; the last one is the goal.
-        actions: N; action i is taken in state i and leads to state i + 1: the surface
-            that makes a contact or moves it. None where contacts are given up alone.
+        states: N + 1 stances; the last one is the goal.
+        actions: N; action i leads from state i to state i + 1: the surface that makes
+            a contact or moves it. None where contacts are only broken.
     """
 
     source: str
@@ -75,14 +75,14 @@ class Option:
 
     Attributes:
         name: `ac1`, `ac2` ...: the same cycle in the same region has the same name.
-        region: In which its contacts are made; `goal` for those on the ground that end
-            the demonstration.
-        surfaces: In the order in which the cycle moves them.
-        repeats: How often in a row the demonstration shows it; with several of them,
-            the median.
-        initiation: Regions of the states in which it was seen to begin.
+        region: Where its contacts are made, `G`, `M` or `O`; `goal` for those on the
+            ground that end the demonstration.
+        surfaces: The surfaces that it moves, in order.
+        repeats: How often in a row the demonstration shows the cycle; the median of
+            several demonstrations.
+        initiation: Initiation set: regions of the states in which it was seen to begin.
         held: Surfaces in contact whenever it was seen to begin.
-        termination: Region of the option after it; `goal` for the last one.
+        termination: Termination set: region of the next option; `goal` for the last.
     """
 
     name: str
@@ -115,10 +115,10 @@ class PelvisDistribution:
     """Normal distributions of the pelvis's roll, pitch and yaw (5.5, 5.6).
 
     Attributes:
-        mean: (3,) [rad], on the circle.
-        sigma: (3,) standard deviations about it [rad]; infinite where there are no two
+        mean: (3,) circular means [rad].
+        sigma: (3,) standard deviations about them [rad]; infinite with fewer than two
             samples.
-        samples: How many states it was made of.
+        samples: Number of states that it was estimated from.
     """
 
     mean: np.ndarray
@@ -149,7 +149,7 @@ class PelvisDistribution:
         )
 
     def clip(self, angles: np.ndarray) -> np.ndarray:
-        """Nearest (3,) angles within what is imposed [algorithm 3, step 14]."""
+        """The nearest (3,) angles within `imposed` [algorithm 3, step 14]."""
         off = wrap(np.asarray(angles, dtype=float) - self.mean)
         within = self.mean + np.clip(off, -self.sigma, self.sigma)
         return np.where(self.sigma < IMPOSED, wrap(within), angles)
@@ -160,16 +160,16 @@ class GeneralPolicy:
     """Options in the order of the task, and the pelvis's orientation meanwhile.
 
     Attributes:
-        options: In the order in which they follow one another; one may come again.
+        options: In the order of the task; one may occur several times.
         over_top: Pelvis over the top, yaw against the edge that was climbed up.
         near_edge: Pelvis near an edge that was climbed, yaw against that edge: 0 faces
             the obstacle.
         goal: Surfaces in contact at the end.
         reach: Longest step of each surface on one support, in lengths of its limb
             (upper arm + forearm, thigh + shank): the `max_i` of (5.9).
-        demos: What it was contracted from.
+        demos: The demonstrations' tables that it was learned from.
         notes: Where the demonstrations disagree, for people.
-        secondary: Policies of demonstrations that do not fit.
+        secondary: Policies of the demonstrations whose cycles come in another order.
     """
 
     options: tuple[Option, ...]
@@ -202,7 +202,7 @@ class GeneralPolicy:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The demonstrations that it was learned from."""
+        """Names of the demonstrations that it was learned from."""
         return tuple(d.source for d in self.demos)
 
 
@@ -274,10 +274,11 @@ def pelvis_distribution(
         policy: The policy.
         edges: Of the obstacle, as from `climbed_edges`.
         position: (3,) of the pelvis in the world [m].
-        near: Nearer to an edge than this is near it [m]: a thigh's length.
+        near: Distance within which the pelvis is near an edge: a thigh's length [m].
 
     Returns:
-        Angles against the world's axes; None off the obstacle, where nothing is known.
+        Roll, pitch and yaw in the world; None where the pelvis is neither over the top
+        nor near an edge: nothing is known there.
     """
     edge = min(edges, key=lambda e: e.distance(position))
     distance = edge.distance(position)

@@ -31,23 +31,23 @@ class Disturbance:
 
     Attributes:
         height: Boxes are higher than planned by this [m].
-        unevenness: Tops of boxes are uneven: tiles, drawn by `seed`, are up to this
-            much [m] too high or too low.
+        unevenness: Tops of boxes are uneven: tiles are up to this much [m] too high or
+            too low, drawn by `seed`.
         roll: Boxes are tilted by this [rad] about x, through the middle of their near
             edge.
         pitch: Boxes are tilted by this [rad] about their near edge; positive: the far
             end sinks.
-        friction: Coulomb coefficient of ground and boxes, where not the scene's.
+        friction: Friction coefficient of ground and boxes, in place of the scene's.
         x: Error of the start position along x [m].
         y: Error of the start position along y [m].
         yaw: Error of the start heading [rad].
         mass: Factor on the masses and inertias of all links.
         effort: Factor on the effort limits of all joints.
-        delay: From sensing to command [s]; whole milliseconds.
+        delay: Latency from sensing to command [s], in whole milliseconds.
         noise: Factor on the sensors' noise.
-        push: Horizontal force [N] on the pelvis for 0.2 s; by `seed`, its time and its
-            direction.
-        seed: Of the random numbers: noise, tiles, push.
+        push: Horizontal force [N] on the pelvis for 0.2 s, at a time and in a direction
+            drawn by `seed`.
+        seed: Seed of the random numbers: noise, tiles, push.
     """
 
     height: float = 0.0

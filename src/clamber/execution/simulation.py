@@ -56,16 +56,17 @@ class Rollout(Viewed):
             the world; unintended: (M,) normal force on other links [N].
         surfaces: Names of the nS surfaces.
         penetration: (M,) deepest of any contact since the state before [m].
-        contact_step: (K,) after which step a contact was listed.
-        contact_geoms: (K, 2) geoms of the robot and of the scene.
-        contact_load: (K, 2) normal and vertical force on the robot [N].
-        end_speed: (n,) of the pelvis after each step of the last second [m/s].
-        push: (N, 3) force on the pelvis [N], in the world; None where nothing pushed.
-        followed: What was last followed, where that is not the plan.
-        events: What was measured during execution, and what was done about it.
-        fell: The run ended at once because the robot fell.
-        rests_on: Surfaces in contact at the end, as executed, by `surface@support`.
-        plan: What was to be done; None where it was read from disk.
+        contact_step: (K,) step after which each contact was listed.
+        contact_geoms: (K, 2) its geoms, of the robot and of the scene.
+        contact_load: (K, 2) its normal and vertical force on the robot [N].
+        end_speed: (n,) speed of the pelvis after each step of the last second [m/s].
+        push: (N, 3) disturbance force on the pelvis, in the world [N]; None where
+            there is none.
+        followed: The reference as it was last adapted; None where it is the plan's.
+        events: What was measured during execution, and the reaction to it.
+        fell: The robot fell, which ended the run.
+        rests_on: Contacts at the end, as executed, each as `surface@support`.
+        plan: The plan that was executed; None for a rollout read from disk.
     """
 
     world: World
@@ -111,13 +112,14 @@ def simulate(
     """Run the trajectory of a plan in MuJoCo.
 
     Args:
-        plan: What to do.
+        plan: The plan to execute.
         controller: `pid` follows the trajectory open loop, PID on every joint; `mixed`
             makes some joints compliant and reacts to contacts (`executive`).
         disturbance: How the perturbed world differs from the planned one, and how well
             it is sensed.
-        true_scene: Where it is not the planned one.
-        pause: When the robot is told to slow down and to stand for 10 s where it is
+        true_scene: The scene that physics runs, unknown to the planner; None: the
+            planned one.
+        pause: Time at which the robot is told to slow down and to stand still for 10 s
             [s]; None: never. `mixed` only.
         progress: Called with stage, share and note.
 

@@ -238,9 +238,9 @@ def judge(plan: Plan, rollout: Rollout, figures: Figures | None = None) -> Verdi
     """Did the robot end where the plan says, on what it planned to rest on?
 
     Args:
-        plan: What was to be done.
-        rollout: What physics did.
-        figures: Of the rollout, where they are known.
+        plan: The plan that was executed.
+        rollout: Its simulation.
+        figures: Figures of the rollout, where they have been computed.
     """
     assert plan.trajectory is not None
     f = measure(rollout) if figures is None else figures

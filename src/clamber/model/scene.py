@@ -235,13 +235,13 @@ class Box:
     """A box obstacle.
 
     Attributes:
-        name: Of the support that its top is.
+        name: Also that of the support on its top.
         size: (3,) full lengths [m].
         centre: (3,) its middle in the world [m].
-        rotation: (3, 3) of the box in the world.
+        rotation: (3, 3) R_WB of the box's frame in the world.
         friction: Coulomb coefficient of its faces.
-        roughness: Its faces are uneven by about this [m]: what is no contact keeps so
-            much more distance from them.
+        roughness: Unevenness of its faces [m]: links that are not in contact with them
+            keep their distance plus this.
     """
 
     name: str

@@ -243,10 +243,10 @@ SceneLike = Scene | float | str | Path  # a scene, or what `load_scene` makes on
 
 @checks_types
 def load_scene(path: SceneLike) -> Scene:
-    """Read a `scene.yaml`, a drawing of boxes, a mesh or a cloud of points.
+    """Read a scene: a `scene.yaml`, a drawing of boxes, a mesh or a point cloud.
 
-    A drawing is an OBJ, MJCF (`.xml`), URDF or SDF; a mesh an OBJ, STL, PLY, GLB or
-    COLLADA file in metres; a cloud a PLY, PCD or npy.
+    A drawing is an OBJ, MJCF (`.xml`), URDF or SDF file; a mesh an OBJ, STL, PLY, GLB
+    or COLLADA file in metres; a point cloud a PLY, PCD or npy file.
 
     Args:
         path: The file; or the height [m] of one box, see `Scene.from_height`; a `Scene`

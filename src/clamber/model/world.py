@@ -80,26 +80,26 @@ class World:
     """Robot and scene as one compiled model, with indices and limits.
 
     Attributes:
-        model: Compiled, at the physics step.
-        xml: The MJCF text, geoms of surfaces renamed to begin with the surface's name.
-        robot: As its files describe it.
-        scene: That it stands in.
+        model: The compiled model, with the physics time step.
+        xml: Its MJCF text; names of a surface's geoms begin with the surface's.
+        robot: The robot as its files describe it.
+        scene: The scene that it stands in.
         home: (nq,) standing at the scene's start, soles on the ground.
-        surfaces: By name.
-        edges: Of a flat surface, the four that it may roll onto.
+        surfaces: The contact surfaces by name.
+        edges: For each flat surface, the four edges that it may roll onto.
         joints: (na,) names of the actuated ones.
-        qadr, dadr: (na,) their indices in q and v.
+        qadr, dadr: (na,) indices of the actuated joints in q and v.
         q_min, q_max: (nv,) joint limits aligned with `v`; infinite for the base.
         tau_max: (na,) effort limits [N m].
         kp, kd, ki: (na,) servo gains [N m/rad], [N m s/rad], [N m/(rad s)].
-        pairs: (P, 2) geom pairs that can meet: robot and scene, robot and itself.
-        support_geom: Geom of each support; support_of_geom: the other way, with the
-            tiles of an uneven top.
-        supports: By name.
-        touching: By surface and support, the pairs that touch in their contact: those
-            that plan it, and those of the surface's further geoms.
+        pairs: (P, 2) geom pairs that may collide: robot and scene, robot and itself.
+        support_geom: Geom id of each support, by name.
+        support_of_geom: Support of each geom id, tiles of an uneven top included.
+        supports: The supports by name.
+        touching: By surface and support, indices of the pairs that touch in that
+            contact: those that define it, and those of the surface's further geoms.
         base: Id of the pelvis body.
-        mass: Of the whole robot [kg].
+        mass: Mass of the whole robot [kg].
     """
 
     model: mujoco.MjModel

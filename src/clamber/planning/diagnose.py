@@ -38,13 +38,13 @@ class Checkup:
     """A robot by its figures.
 
     Attributes:
-        mass: [kg].
-        joints: Actuated ones.
-        lengths: Of each limb, root to end [m].
-        segments: Of upper arm, forearm, thigh and shank [m].
-        knee_height: Over the sole, the shank upright [m].
-        com_height: As it stands [m].
-        faults: What is wrong, a sentence each; none: it can be planned for.
+        mass: Mass of the whole robot [kg].
+        joints: Number of actuated joints.
+        lengths: Length of each limb, root to end [m].
+        segments: Lengths of upper arm, forearm, thigh and shank [m].
+        knee_height: Height of the knee over the sole with the shank upright [m].
+        com_height: Height of the centre of mass in the nominal posture [m].
+        faults: What is wrong, a sentence each; without any it can be planned for.
     """
 
     mass: float
@@ -60,7 +60,7 @@ class Checkup:
 
 @checks_types
 def check_robot(robot: RobotLike) -> Checkup:
-    """Stand the robot up alone and look at it.
+    """Check a robot in its nominal posture: figures, and what is wrong with it.
 
     Args:
         robot: A robot, its name, or its `robot.yaml`.

@@ -72,11 +72,11 @@ class Ranked:
     """A planned alternative.
 
     Attributes:
-        surfaces: By which its limbs differ; for a plan that was searched for, those
-            that make contacts, in order.
+        surfaces: The surfaces that were chosen; for a plan found by search, those that
+            make contacts, in order.
         source: Where the contacts come from.
-        plan: As far as it goes.
-        cost: Way to the contacts and their projected distances, summed [m].
+        plan: The plan, complete or not.
+        cost: Swing distances plus projected distances, see `plan_cost` [m].
     """
 
     surfaces: tuple[str, ...]
@@ -94,12 +94,13 @@ class Ranked:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Replanned:
-    """What there is besides the demonstrated contacts.
+    """The alternatives to the demonstrated contacts, planned and ranked.
 
     Attributes:
-        differences: Surfaces of each stance after the first that the first has not.
-        ranked: The best first.
-        tried: What it took.
+        differences: For each stance after the first, the surfaces that the first has
+            not.
+        ranked: The alternatives, the best first.
+        tried: Each proposer, with the number of steps that it tried.
     """
 
     differences: tuple[tuple[str, ...], ...]
@@ -131,21 +132,22 @@ def plan(
     """Plan the whole motion, or what is left of it.
 
     Args:
-        goal: What a person has done; or a policy, which leads to the scene's goal.
+        goal: A demonstrated contact sequence, or a policy that leads to the goal of the
+            scene.
         robot: A robot, its name, or its `robot.yaml`.
-        scene: Where it is, its file, or the height of one box [m]; from the middle of a
-            climb, as it is believed to be.
-        start: Where the robot is, in the middle of a climb, or the keyframe to go on
-            from; None: it stands where the scene says. From the middle, where there is
-            no way at the distance that roughness or `clearance` asks for, that is not
-            kept.
+        scene: A scene, its file, or the height of one box [m]; in the middle of a
+            climb, the scene as it is believed to be.
+        start: The state of a robot in the middle of a climb, or the keyframe to go on
+            from; None: it stands at the scene's start. From the middle of a climb,
+            extra clearance for roughness or by `clearance` is given up where there is
+            no path that keeps it.
         options: How it is planned.
-        contacts: `any`: others where the demonstrated ones do not lead to the end;
-            `Plan.fallback` says which, or what was tried.
-        budget: How much is tried for others.
-        counts: How often a demonstration takes an action, which others are searched
-            for by; None: as often as this one.
-        clearance: How much farther parts stay from supports, see `IK`.
+        contacts: `any`: other contacts where the demonstrated ones do not lead to the
+            end, `Plan.fallback` says which, or what was tried; `demonstrated`: none.
+        budget: How much is tried in search of other contacts.
+        counts: How often demonstrations take each action, which guides that search;
+            None: as often as this one does.
+        clearance: Extra distance [m] of links from supports, see `IK`.
         progress: Called with stage, share and note.
 
     Raises:
@@ -188,11 +190,11 @@ def replan(
     """Plan every alternative and rank them; search where none is stable.
 
     Args:
-        sequence: As demonstrated.
+        sequence: The demonstrated contact sequence.
         robot: A robot, its name, or its `robot.yaml`.
-        scene: Where it climbs, its file, or the height of one box [m].
+        scene: A scene, its file, or the height of one box [m].
         options: How each is planned.
-        budget: Of the search.
+        budget: How much the search tries.
         counts: As in `plan`.
         progress: Called with stage, share and note.
 

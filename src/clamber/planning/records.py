@@ -68,11 +68,11 @@ class Budget:
     """How much a plan may try beyond what is demonstrated.
 
     Attributes:
-        tries: Steps that each search for other contacts plans at most; 0: none, there
-            is no search. A step takes from a tenth of a second to two seconds.
-        depth: Contact changes that it adds at most.
-        seconds: Of all that is tried, looked at between two steps; None: no bound. With
-            one, what is found depends on the machine.
+        tries: Most steps that each search for other contacts plans; 0: no search. A
+            step takes from a tenth of a second to two seconds.
+        depth: Most contact changes that a search adds.
+        seconds: Time limit of all attempts together [s], checked between two steps;
+            None: no limit. With one, what is found depends on the machine.
         ahead: Contact changes of a policy that are planned before it stops for more;
             None: as far as `PlanOptions.max_changes`.
     """
@@ -99,7 +99,7 @@ class Attempt:
     """A step that was tried.
 
     Attributes:
-        proposer: What wanted it: `demonstrated`, surfaces in place of others, `search`.
+        proposer: Who proposed it: `demonstrated`, an alternative's surfaces, `search`.
         step: What it was.
         failure: Why it is not possible; None: it is.
     """
@@ -159,13 +159,13 @@ def told(tried: Sequence[Tried]) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class State:
-    """Where a robot is: a plan may begin anywhere.
+    """The state of a robot from which a plan begins.
 
     Attributes:
-        stance: Its contacts, each where it is.
-        loaded: Those of them that bear load already.
-        q: (nq,) its posture, the joints as they are commanded: the way begins there.
-        done: Steps of the plan's sequence that it has done.
+        stance: Its contacts, where they are in the world.
+        loaded: Those of them that bear load.
+        q: (nq,) its posture, with the commanded joint angles: the motion begins there.
+        done: Number of steps of the plan's sequence that it has done.
     """
 
     stance: tuple[Contact, ...]
@@ -233,11 +233,11 @@ class Fallback:
     """What took the place of what was asked for, and why; as a string, a clause.
 
     Attributes:
-        reason: Why not as demonstrated; empty where nothing was missed.
-        source: Where the other contacts come from; None: there are none either.
-        surfaces: That make them.
-        detail: Where a secondary policy was followed, for people.
-        tried: All that was looked at.
+        reason: Why the demonstrated contacts were not taken; empty where they were.
+        source: Where the contacts come from that were; None: none was found.
+        surfaces: The surfaces that make them.
+        detail: The changes that followed a secondary policy, for people.
+        tried: Each proposer, with the number of steps that it tried.
     """
 
     reason: str
@@ -262,20 +262,20 @@ class Plan(Viewed):
 
     Attributes:
         world: Robot and scene.
-        options: With the weights of the search that got farthest.
-        sequence: The demonstration in the robot's scene.
-        start: The keyframe that it begins with.
-        changes: Of contacts, one after the other.
+        options: As asked for; the weights are those of the attempt that got farthest.
+        sequence: The demonstration at the robot's scale, in its scene.
+        start: The first keyframe.
+        changes: The contact changes, in order.
         skipped: Stances left out because there was nothing to do.
-        failures: Steps for which there is no way; what a policy is stuck at.
-        trajectory: None where nothing moves.
-        complete: Nothing is missed, and it gets to the end.
-        state: Where the robot is, where that is not the scene's start: it settles from
-            there into the first keyframe.
-        fallback: What it does that is not what was asked for.
-        policy: That it was planned with; None where it follows a demonstration.
-        iterations: Of the policy, one for each change.
-        timings: Seconds by stage.
+        failures: Steps that could not be planned; of a policy, the one it stopped at.
+        trajectory: The timed reference; None where nothing moves.
+        complete: Every step is planned, up to the end.
+        state: Where the robot is, if not at the scene's start; the motion begins there
+            and goes to the first keyframe.
+        fallback: What it does in place of what was asked for; None: nothing.
+        policy: The policy that it was planned with; None: it follows a demonstration.
+        iterations: The policy's option and cost-to-go, one for each change.
+        timings: Computing time by stage [s].
     """
 
     world: World
@@ -302,7 +302,7 @@ class Plan(Viewed):
 
     @property
     def why_not(self) -> str:
-        """Why it is not complete: the first reason there is; empty where it is."""
+        """The first reason why it is not complete; empty where it is."""
         if self.complete:
             return ""
         reasons = (*map(str, self.failures), *(s.reason for s in self.skipped))

@@ -129,15 +129,15 @@ def state_of(
     *,
     source: object = "state",
 ) -> State:
-    """Where a robot is in a plan, from its posture.
+    """The state of a robot, with its progress along a plan, from its posture.
 
     Args:
-        plan: That it was following.
-        scene: As it is now.
+        plan: The plan that it was executing.
+        scene: The scene as it is now.
         q: (nq,) posture.
-        touching: Support of each surface in contact; None: whatever lies within 5 mm
-            of a support. Of a limb's surfaces the one nearest to the trunk counts.
-        source: Of the posture, for errors.
+        touching: Support of each surface in contact; None: surfaces within 5 mm of a
+            support are. Of a limb's surfaces the one nearest to the trunk counts.
+        source: Where the posture comes from, for error messages.
 
     Raises:
         InputError: A surface or support is unknown, or they are not in contact.

@@ -37,8 +37,8 @@ class Alternative:
     """A sequence in which each limb keeps to one of its surfaces.
 
     Attributes:
-        surfaces: Those chosen, of the limbs that offer several.
-        sequence: Without the others.
+        surfaces: The one chosen for each limb that offers several.
+        sequence: The demonstrated sequence without contacts on the others.
     """
 
     surfaces: tuple[str, ...]
@@ -49,7 +49,7 @@ class Alternative:
 
 @checks_types
 def contact_differences(sequence: ContactSequence) -> tuple[tuple[str, ...], ...]:
-    """Surfaces of each stance after the first that the first has not: Cd_i.
+    """For each stance after the first, the surfaces that the first has not: Cd_i.
 
     Args:
         sequence: As demonstrated.
@@ -163,9 +163,9 @@ def without_surfaces(
 def plan_cost(made: Plan) -> float:
     """Swing distances of the surfaces, and projected distances, summed [m].
 
-    The way is the straight line from where a surface is before the move, the shortest
-    that there is. A step that has no path counts with what is wanted of it, from the
-    last keyframe.
+    A swing distance is that of the straight line from where the surface was to where
+    its new contact is. A step without a path counts with its reference contact, from
+    the last keyframe on.
 
     Args:
         made: The plan, whole or not.

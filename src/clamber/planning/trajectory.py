@@ -81,13 +81,16 @@ class Trajectory:
     """A timed reference.
 
     Attributes:
-        time: (T,) [s]; q: (T, nq); v: (T, nv) the derivative of q on the manifold.
-        tau: (T, na) feed-forward joint torques [N m]. As planned, these three are
-            sampled when they are asked for.
+        time: (T,) sample times [s].
+        q: (T, nq) configuration.
+        v: (T, nv) its derivative, in the tangent space.
+        tau: (T, na) feed-forward joint torques [N m]. Of a fresh plan, q, v and tau are
+            computed when they are asked for.
         contact: (T, nS) bool, closed contacts.
         surfaces, joints: (nS,), (na,) names.
         keyframes: (K,) time at which each keyframe is reached [s].
-        segments: What the samples are part of, in order; empty where nobody knows.
+        segments: The phases that the samples belong to, in order; empty where these
+            are not known.
     """
 
     time: np.ndarray

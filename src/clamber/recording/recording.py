@@ -155,17 +155,18 @@ def load_demo(
             `recording.yaml`, or a recording: C3D, TRC, BVH, Motive's CSV, an array
             (`.npy`, or `.npz` with `positions`, `names` and `rate`), or the motion of a
             body or a robot (`.npz`, `.pkl`).
-        scene: Replaces the boxes of the recording, in its coordinates.
-        names: Of the columns of a bare array: a list, or a JSON file with one.
-        rate: Of a bare array, or in place of the file's own [Hz].
-        span: Part of the recording to keep [s]; of a `recording.yaml`, its own by
-            default.
+        scene: The scene it was recorded in, in the recording's coordinates; replaces
+            its own boxes.
+        names: Names of a bare array's points: a list, or a JSON file with one.
+        rate: Sampling rate of a bare array, or in place of the file's own [Hz].
+        span: Part of the recording to keep, from and to [s]; None: all of it, or the
+            span of a `recording.yaml`.
         fit_floor: Correct the heights of floor and boxes by whatever rests on them, not
             only where the floor is off beyond doubt.
-        subject: Which person, where several were recorded.
-        body_model: SMPL's, SMPL-H's or SMPL-X's file, for poses without joints.
-        robot: Whose motion it is, where it is a robot's: a built-in one by name, or a
-            robot.yaml.
+        subject: Name of the person, where several were recorded.
+        body_model: File of SMPL, SMPL-H or SMPL-X, for poses without joints.
+        robot: The robot, where the recording is a robot's motion: a built-in one by
+            name, or a robot.yaml.
 
     Raises:
         InputError: The name is unknown, or the file, or one that it names, or a field

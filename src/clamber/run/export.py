@@ -66,13 +66,14 @@ class Motion:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Exported:
-    """What was written.
+    """The file that was written.
 
     Attributes:
-        file: Where.
-        rate: [Hz]; samples: how many.
-        lead_in: [s] before the run itself.
-        forces: Contact forces are in it, because physics has run.
+        file: Its path.
+        rate: Sampling rate [Hz].
+        samples: Number of samples.
+        lead_in: Duration of the motion before the run itself [s].
+        forces: Whether it has contact forces: it does once physics has run.
     """
 
     file: Path
@@ -99,7 +100,8 @@ def export_run(
         folder: A run folder that holds a plan.
         to: `csv`; `mcap`: ROS 2 messages; `npz`: for whole-body tracking.
         out: The file; `motion.<to>` in the run folder by default.
-        rate: [Hz] a divisor of 1000; 100 for `csv` and `mcap`, 50 for `npz` by default.
+        rate: Sampling rate [Hz], a divisor of 1000; 100 for `csv` and `mcap`, 50 for
+            `npz` by default.
         lead_in: Measured joint angles [rad] by name, the file that holds them, or
             `home`: a motion from there to the first posture comes first.
         lead_in_speed: Largest joint speed of that motion [rad/s].

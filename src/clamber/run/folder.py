@@ -178,7 +178,7 @@ def save_policy(policy: GeneralPolicy, path: str | Path) -> None:
     """Write `policy.json`: the general policy and the demo policies behind it.
 
     Args:
-        policy: As learned.
+        policy: The policy.
         path: The file.
     """
     write_json(Path(path), CODEC.encode(policy))
@@ -267,8 +267,8 @@ def load_plan(folder: str | Path, *, without: Collection[str] = ()) -> Plan:
 
     Args:
         folder: The run folder.
-        without: Of `planned.npz` and `timings.json`, what is not read: it may be
-            broken then.
+        without: Files not to read, `planned.npz` or `timings.json`; they may then be
+            broken.
 
     Raises:
         InputError: A file is missing, broken, or does not fit the others.
@@ -498,11 +498,11 @@ def save_replanned(found: Replanned, folder: str | Path) -> None:
 
 @checks_types
 def save_rollout(plan: Plan, rollout: Rollout, folder: str | Path) -> None:
-    """Write what physics did, and what it ran: the world and what was last followed.
+    """Write a rollout, with the world that physics ran and the adapted reference.
 
     Args:
-        plan: That was to be done, as `save_plan` wrote it there.
-        rollout: Of that plan.
+        plan: The plan that was executed, as `save_plan` wrote it there.
+        rollout: Its simulation.
         folder: The run folder.
     """
     folder = Path(folder)
@@ -530,8 +530,8 @@ def load_rollout(folder: str | Path, *, with_events: bool = True) -> Rollout:
 
     Args:
         folder: The run folder.
-        with_events: Without them, `execution.json` may be broken: nothing is said of
-            events or a fall, and the scene is the planned one.
+        with_events: Read `execution.json` too. Without it, which may then be broken,
+            there are no events and no fall, and the scene is the planned one.
 
     Raises:
         InputError: A file is missing or broken.
@@ -573,7 +573,7 @@ def save_verdict(verdict: Verdict, folder: str | Path) -> None:
     """Write `verdict.json`.
 
     Args:
-        verdict: Of a rollout.
+        verdict: The verdict on the folder's rollout.
         folder: The run folder.
     """
     write_json(Path(folder) / VERDICT, CODEC.encode(verdict))

@@ -16,8 +16,8 @@ def save_proposal(proposal: Proposal, folder: str | Path) -> None:
     """Write `robot.yaml`, the model that it names, and meshes into a folder.
 
     Args:
-        proposal: Of a robot.
-        folder: That exists.
+        proposal: The proposal.
+        folder: An existing folder.
     """
     files = {f"{MESH_FOLDER}/{n}": content for n, content in proposal.files.items()}
     files[proposal.fields["model"]] = proposal.mjcf.encode()

@@ -62,7 +62,7 @@ def open_view(
     host: str = "127.0.0.1",
     port: int = 8080,
 ) -> Page:
-    """Serve a run or a recording, or the way to a first one, as a page in the browser.
+    """Serve a run, a recording, or the start page of a new climb, to the browser.
 
     Args:
         source: A run folder, complete or not; a recording, a `recording.yaml`, or a
@@ -71,9 +71,9 @@ def open_view(
         beside: Run folders that are shown to the right of it.
         demo: The recording that is shown beside a run; by default the one that the run
             names as its source, where that is found.
-        scene: Of a recording that has none.
-        host: To listen on: this machine alone, unless it says otherwise.
-        port: Or the next one that is free.
+        scene: The scene of a recording that has none.
+        host: Address to listen on; by default this machine alone can connect.
+        port: Port to listen on, or the next one that is free.
 
     Returns:
         The page: `url`, `missing` (a sentence for each thing that cannot be shown),

@@ -62,10 +62,10 @@ SHARP = 32767  # the largest packed number; one below the smallest stands for no
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Reported:
-    """What was written.
+    """The report that was written.
 
     Attributes:
-        file: The page.
+        file: The HTML file.
         missing: A sentence for each file that could not be shown.
     """
 

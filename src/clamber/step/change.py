@@ -41,10 +41,11 @@ class Change:
     """One contact change that is possible.
 
     Attributes:
-        step: What changes, its contact where it is made.
-        keyframe: The posture after it.
-        phases: The way there: shift of the weight, swing of the limb, settling.
-        margin: Of the centre of mass to the border of its polygon, throughout [m].
+        step: The limb and its contacts; the new one at its optimised place.
+        keyframe: The posture after the change.
+        phases: The motion there: weight shift, swing, loading.
+        margin: Least distance of the centre of mass, throughout the change, from the
+            border of the support polygon [m].
     """
 
     step: Step
@@ -56,18 +57,18 @@ class Change:
 
     @property
     def leaving(self) -> tuple[Contact, ...]:
-        """Contacts that are broken, as they were."""
+        """The contacts that are broken."""
         breaks = self.step.breaks
         return tuple(c for c in self.phases[0].load_before if c.surface in breaks)
 
     @property
     def shifted(self) -> np.ndarray:
-        """(nq,) the weight on the contacts that stay."""
+        """(nq,) the posture with the weight on the contacts that stay."""
         return self.phases[0].q[-1]
 
     @property
     def touching(self) -> np.ndarray:
-        """(nq,) the new contact closed, not loaded."""
+        """(nq,) the posture in which the new contact is closed, not yet loaded."""
         return self.phases[1].q[-1]
 
 
@@ -76,9 +77,9 @@ class Failure:
     """Why a step cannot be planned; as a string, a sentence.
 
     Attributes:
-        status: What kind of reason it is.
-        step: That was looked at; None where it is not about a single one.
-        detail: More than `status` says, where there is more.
+        status: The kind of reason.
+        step: The step that fails; None where no single one does.
+        detail: The reason in full, where there is more to say than `status` does.
     """
 
     status: Status

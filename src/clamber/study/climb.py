@@ -51,20 +51,20 @@ Contacts = Literal["any", "demonstrated"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Climb:
-    """The flags of one climb.
+    """One climb of a sweep, by the flags of `clamber climb`.
 
     Attributes:
-        demo: A recording, or a built-in demonstration.
-        robot: A built-in robot, or a robot.yaml.
-        height: Of the one box [m]; either this or `scene`.
+        demo: A recording, or a built-in demonstration by name.
+        robot: A built-in robot by name, or a robot.yaml.
+        height: Height of the one box [m]; either this or `scene`.
         scene: A scene.yaml.
         method: How contact positions are optimised.
         speed: Largest joint speed [rad/s], or `max`.
         robust: Keep to contact changes that hold in the worst case, see `PlanOptions`.
         controller: `pid` or `mixed`.
-        contacts: `any`: others than the demonstrated ones where those have no stable
-            plan; or `demonstrated` only.
-        budget: Of all planning [s]; None: no bound.
+        contacts: `any`: other contacts where the demonstrated ones have no stable plan;
+            `demonstrated`: these only.
+        budget: Time limit of all planning [s]; None: no limit.
         search: How far to search for other contacts.
         disturb: What the planner does not know.
     """
@@ -105,8 +105,8 @@ class ClimbResult:
     Attributes:
         reached: The verdict.
         why: What failed first; empty where nothing did.
-        seconds: Of motion, until the end or the fall [s]; 0 where there was no plan.
-        replans: How often the rest was replanned during execution.
+        seconds: Duration of the motion, to its end or the fall [s]; 0 without a plan.
+        replans: How often the remaining motion was replanned during execution.
         effort: Largest effort of any joint, share of its limit.
     """
 

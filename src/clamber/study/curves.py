@@ -136,9 +136,9 @@ def save_curves(spec: Spec, rows: Rows, folder: str | Path) -> list[Path]:
     """Write `summary.csv`, `curve.csv` and `success.png`.
 
     Args:
-        spec: Of the sweep.
-        rows: That are finished.
-        folder: That exists.
+        spec: The sweep's spec.
+        rows: Its finished runs.
+        folder: An existing folder.
     """
     folder = Path(folder)
     tables = {SUMMARY: summarise(spec, rows), CURVE: bins(spec, rows)}

@@ -198,13 +198,17 @@ class Search(_Strict):
 
 
 class Spec(_Strict):
-    """`clamber sweep`'s file: one of `grid`, `random` and `search`.
+    """The spec of a sweep: exactly one of `grid`, `random` and `search`.
 
     Attributes:
-        about: What it asks, in a sentence.
-        seed: Run k of a strand has `--disturb.seed seed + k`.
-        controllers: Each does all runs.
+        version: Of the format.
+        about: The question that it answers, in a sentence.
+        seed: Run k of each series has `--disturb.seed seed + k`.
+        controllers: Controllers that are compared; each does all runs.
         base: Flags that all runs share.
+        grid: Levels of each flag; every combination is run.
+        random: A random sample of flags.
+        search: A factor; the level at which success falls through one half is sought.
     """
 
     version: Literal[1] = 1

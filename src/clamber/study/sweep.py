@@ -93,14 +93,14 @@ def run_sweep(
     job: JobFunction = run_climb,
     progress: Progress | None = None,
 ) -> tuple[Rows, Pace]:
-    """Do all runs of a spec that the folder does not hold yet.
+    """Do the runs of a spec that its folder does not hold yet.
 
     Args:
         spec: What to run; with more `runs` than before, those are added.
         folder: Holds `spec.yaml` and `runs.csv`; made, or continued.
         workers: Processes; None: one for each core.
-        scheduler: Address of a `dask.distributed` scheduler, whose workers do the jobs
-            in place of processes here.
+        scheduler: Address of a `dask.distributed` scheduler whose workers do the runs
+            in place of local processes.
         job: Does one job; must be importable by the workers.
         progress: Called with stage, share and note.
 
