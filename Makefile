@@ -94,7 +94,7 @@ pictures: $(VENV)/.has-video ## the pictures of the documentation anew, from a c
 	cp build/policy/policy-pelvis.png docs/policy-pelvis.png
 	$(BIN)/python docs/tools/pictures.py docs/stages
 
-front: $(VENV)/.has-video ## the moving picture of the first page anew (fetches a G1, 145 MB; minutes)
+front: $(VENV)/.has-video ## the pictures of the first page anew (fetches a G1, 145 MB; minutes)
 	rm -rf $(FRONT)/climb $(FRONT)/crossing $(FRONT)/robot
 	test -d $(FRONT)/wheels || $(BIN)/python $(PIP) --no-deps --target $(FRONT)/wheels mjlab example-robot-data
 	$(BIN)/clamber robot init $(FRONT)/wheels/mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml --out $(FRONT)/robot \
@@ -103,6 +103,7 @@ front: $(VENV)/.has-video ## the moving picture of the first page anew (fetches 
 	$(BIN)/clamber learn crossing --out $(FRONT)/policy.json
 	$(BIN)/clamber traverse $(FRONT)/policy.json --scene docs/tools/crossing.yaml --out $(FRONT)/crossing
 	$(BIN)/python docs/tools/front.py $(FRONT) docs/front.webp
+	$(BIN)/clamber render $(FRONT)/crossing --frame 17 --size 960x540 --out docs/crossing.png
 
 experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)
 	for f in examples/experiments/*.yaml; do \

@@ -584,6 +584,15 @@ def test_learning_again_shows_the_options_and_writes_the_same_bytes(
         assert said in out
 
 
+def test_a_folder_of_that_name_does_not_hide_a_built_in_demonstration(
+    tmp_path: Path, monkeypatch: Patch, capsys: Capture
+):
+    monkeypatch.chdir(tmp_path)
+    Path("climb").mkdir()  # which shows no cycle to learn from
+    assert cli.main(["learn", "climb"]) == 2
+    assert "sequence.json" not in capsys.readouterr().err
+
+
 # Sweeps.
 
 

@@ -445,8 +445,10 @@ class LearnCommand:
 
 def _sequence(name: str) -> clamber.ContactSequence:
     """The contact sequence of a file, or what is detected in a recording."""
+    from clamber.recording.built_in import BUILT_IN
+
     path = Path(name)
-    if path.suffix == ".json" or path.is_dir():
+    if path.suffix == ".json" or (name not in BUILT_IN and path.is_dir()):
         return clamber.load_sequence(path)
     return clamber.detect_contacts(clamber.load_demo(name))
 

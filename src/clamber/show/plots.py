@@ -224,14 +224,14 @@ def _draw_table(ax: Axes, demo: DemoPolicy) -> None:
         action = demo.actions[i]
         weak = {"color": "0.55", "style": "italic"}
         look: dict[str, Any] = {} if i in ruling else weak
-        text = "breaks contact" if action is None else action
+        text = "breaks" if action is None else action
         ax.text(x + 0.5, y + 0.1, text, ha="center", fontsize=6.5, **look)
     rows = math.ceil(len(demo.states) / PER_ROW)
     for k, (region, text) in enumerate(MEANING.items()):
         x, y = 1.6 * k, -0.8 * rows
         ax.add_patch(Circle((x, y), 0.12, fc=COLOURS[region], ec="0.3", lw=0.8))
         ax.text(x + 0.2, y, text, va="center", fontsize=7.5)
-    grey = "grey: the limb is loaded through another surface"
+    grey = "grey: the limb is loaded through another surface, or breaks its contact"
     ax.text(1.6 * 3, -0.8 * rows, grey, va="center", fontsize=7.5, color="0.45")
     ax.set_xlim(-0.4, PER_ROW - 0.1)
     ax.set_ylim(-0.8 * rows - 0.3, 0.4)
@@ -261,7 +261,7 @@ def pelvis_plot(policy: GeneralPolicy, path: str | Path) -> Path:
         seen = np.concatenate([np.zeros((0, 3)), *(s[which] for s in samples)])
         for k, name in enumerate(ANGLES):
             _draw_angle(axes[k, column], distribution, k, seen[:, k])
-            axes[k, 0].set_ylabel(f"{name}: density", fontsize=8)
+            axes[k, 0].set_ylabel(f"{name}: density [1/deg]", fontsize=8)
         axes[0, column].set_title(
             f"{title}, {distribution.samples} states", fontsize=9, loc="left"
         )
@@ -289,5 +289,7 @@ def _draw_angle(ax: Axes, d: PelvisDistribution, k: int, seen: np.ndarray) -> No
     ax.set_xlim(-180.0, 180.0)
     ax.set_xticks(np.arange(-180, 181, 90))
     ax.margins(y=0.25)
+    top = ax.get_ylim()[1]
+    ax.set_yticks([y for y in ax.get_yticks() if 0.0 <= y <= top])
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=7)
