@@ -18,13 +18,15 @@ import clamber
 from clamber import cli
 from clamber.contact.contact import region_of
 from clamber.errors import InputError, MissingDependency
+from clamber.execution.simulation import Rollout
 from clamber.model.scene import Scene
 from clamber.planning.records import Plan
 from clamber.show import editor, scene3d
 from clamber.show.editor import Edits
-from clamber.show.live import open_view
+from clamber.show.live import LAYERS, open_view
 from clamber.show.page import Clock, paragraphs
 from clamber.show.sample import keyframe_times, sample_motion
+from clamber.show.scene3d import Stage
 from clamber.show.skeleton import (
     Skeleton,
     paired_times,
@@ -298,6 +300,20 @@ def test_a_plan_without_trajectory_is_served_by_its_keyframes(
     page = open_view(tmp_path, port=18080)
     assert page.clock.events == [0.0, 1.0]
     page.close()
+
+
+def test_a_run_beside_a_longer_one_says_that_it_is_done(
+    one_hand_plan: Plan, one_hand_rollout: Rollout
+):
+    viser = pytest.importorskip("viser")
+    server = viser.ViserServer(host="127.0.0.1", port=18080, verbose=False)
+    stage = Stage(server, one_hand_plan, one_hand_rollout, "/run")
+    end = stage.duration
+    assert f"{end:.2f} of {end:.1f} s; " in stage.show(end, dict(LAYERS))
+    assert f"{end + 9:.2f} s; done after {end:.1f} s" in stage.show(
+        end + 9, dict(LAYERS)
+    )
+    server.stop()
 
 
 def test_a_port_in_use_takes_the_next_one(whole: Path):

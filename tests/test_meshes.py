@@ -11,6 +11,7 @@ import pytest
 import clamber
 from clamber.show.meshes import (
     MAX_TRIANGLES,
+    PAD_COLOUR,
     body_meshes,
     geom_colour,
     geom_triangles,
@@ -118,6 +119,10 @@ def test_a_material_colours_what_has_no_colour_of_its_own(model: mujoco.MjModel)
     np.testing.assert_allclose(plain, [0.5, 0.5, 0.5, 1])
     colours = {m.body: m.colours for m in body_meshes(model)}[1]
     assert np.any(np.all(np.isclose(colours, red[:3]), axis=1))
+    pads = [model.geom("sphere").id]
+    colours = {m.body: m.colours for m in body_meshes(model, pads=pads)}[1]
+    assert not np.any(np.all(np.isclose(colours, red[:3]), axis=1))
+    assert np.any(np.all(np.isclose(colours, PAD_COLOUR[:3]), axis=1))
 
 
 def fine_sphere() -> tuple[np.ndarray, np.ndarray]:

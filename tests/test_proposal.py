@@ -29,6 +29,7 @@ from clamber.model.tree import Tree, geom_points, geom_volume, joint_range
 from clamber.model.world import build_world
 from clamber.planning.diagnose import check_robot
 from clamber.run.proposal import save_proposal
+from clamber.show.meshes import pads_of
 from test_description import CUBE, stl
 
 TEXTS = {"mjcf": humanoids.mjcf, "urdf": humanoids.urdf}
@@ -457,6 +458,9 @@ def test_what_is_seen_of_a_robot_stays_where_it_is_and_is_only_seen(tmp_path):
     seen = np.flatnonzero(world.model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
     assert len(seen) == 2
     assert not np.isin(world.pairs, seen).any()
+    surfaces = {g for s in world.surfaces.values() for g in s.geoms}
+    assert set(pads_of(world)) == surfaces  # beside meshes they are pads of rubber
+    assert pads_of(build_world("coman", Scene(start=np.zeros(3)))) == []
 
 
 def test_names_of_a_description_cannot_leave_the_folder(tmp_path):

@@ -154,10 +154,12 @@ def _show_run(
     page: Page, run: Run, others: Sequence[Run] = (), person: Skeleton | None = None
 ) -> None:
     """The page of a run folder: its motion, else its recording, else text."""
-    notes = (fallback_note(run.written), run.execution.get("stopped", ""))
-    page.begin(run.folder.resolve().name, run.missing, notes)
+    page.begin(run.folder.resolve().name, run.missing)
     told = _Told(page.server.gui)
     told.of_run(run.verdict)
+    notes = (fallback_note(run.written), run.execution.get("stopped", ""))
+    if any(notes):  # below the verdict: another plan than the demonstrated may succeed
+        page.server.gui.add_html(paragraphs([n for n in notes if n]))
     if run.plan is not None:
         _RunPage(page, run, run.plan, others, person, told)
         return

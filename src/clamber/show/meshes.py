@@ -10,7 +10,7 @@ Shapes: N vertices, F triangles.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -18,6 +18,7 @@ import numpy as np
 
 from clamber.model.boxes import grid_triangles
 from clamber.model.records import short_repr
+from clamber.model.world import World
 
 SLICES, FEWEST_SLICES = 28, 6  # around a round geom
 SHOWN_GROUPS = (0, 1, 2)  # of geoms, in MuJoCo's viewer
@@ -26,6 +27,7 @@ CREASE = math.radians(40.0)  # an edge that turns by more is sharp
 NEAR_MEAN = 1e-2  # how much the vertex of a cell keeps to the middle of those in it
 AROUND = 64  # faces around a vertex that are looked at
 PLAIN = (0.5, 0.5, 0.5, 1.0)  # a geom's colour where it has none: its material's counts
+PAD_COLOUR = (0.13, 0.14, 0.16, 1.0)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -62,6 +64,7 @@ def body_meshes(
     *,
     max_triangles: int = MAX_TRIANGLES,
     deviation: float = 0.0,
+    pads: Collection[int] = (),
 ) -> list[Mesh]:
     """The visible geoms of each body, tessellated; bodies that show nothing left out.
 
@@ -69,6 +72,7 @@ def body_meshes(
         model: Compiled.
         max_triangles: More than these in mesh geoms are simplified.
         deviation: That faces may be off a round geom [m]: small ones get fewer.
+        pads: Geoms that are drawn as pads of rubber.
     """
     shown = np.flatnonzero(
         np.isin(model.geom_group, SHOWN_GROUPS)
@@ -85,8 +89,9 @@ def body_meshes(
     for g in shown:
         part = geom_triangles(model, int(g), keep, _slices(model, int(g), deviation))
         if part is not None:
-            colour = geom_colour(model, int(g))[:3]
-            by_body.setdefault(int(model.geom_bodyid[g]), []).append((part, colour))
+            colour = np.array(PAD_COLOUR) if g in pads else geom_colour(model, int(g))
+            parts = by_body.setdefault(int(model.geom_bodyid[g]), [])
+            parts.append((part, colour[:3]))
     meshes = []
     for body, parts in sorted(by_body.items()):
         starts = np.cumsum([0, *(len(v) for (v, _, _), _ in parts)])
@@ -104,6 +109,25 @@ def body_meshes(
             )
         )
     return meshes
+
+
+def own_meshes(world: World) -> np.ndarray:
+    """(ngeom,) bool: the meshes that the robot of a world is drawn with."""
+    model = world.model
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+    meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
+    return own & meshes & np.isin(model.geom_group, SHOWN_GROUPS)
+
+
+def pads_of(world: World) -> list[int]:
+    """Geoms of contact surfaces that are drawn as pads of rubber.
+
+    They stand out of a robot's own meshes like balls; as pads they belong to it. A
+    robot without meshes is drawn as it is.
+    """
+    if not own_meshes(world).any():
+        return []
+    return [g for s in world.surfaces.values() for g in s.geoms]
 
 
 def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:

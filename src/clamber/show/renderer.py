@@ -28,7 +28,7 @@ from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat
 from clamber.model.world import World
 from clamber.show.framing import View
-from clamber.show.meshes import SHOWN_GROUPS, geom_colour
+from clamber.show.meshes import PAD_COLOUR, geom_colour, own_meshes, pads_of
 
 STEEP = 70.0  # [deg] elevation from which a camera has no ahead of its own
 Colour = tuple[float, float, float, float]  # in [0, 1]
@@ -43,7 +43,6 @@ HORIZON, GROUND_COLOUR, GRID_COLOUR = (
 )
 GRID_LINE = 3  # of the 256 texels of a square
 BOX_COLOUR: Colour = (0.80, 0.68, 0.53, 1.0)
-PAD_COLOUR: Colour = (0.13, 0.14, 0.16, 1.0)
 CAP_DARK: Colour = (0.16, 0.17, 0.20, 1.0)
 CAP_PALE: Colour = (0.66, 0.69, 0.73, 1.0)
 CAP_NEAR, CAP_REACH, CAP_SHARE = 0.8, 0.95, 0.5  # [radius of the shape around a joint]
@@ -194,7 +193,7 @@ class Camera:
         self._gl = _gl_context(*self._frame)
         self._gl.make_current()
         self._contexts.append(_context(model))
-        if small and not _has_meshes(model, world):
+        if small and not own_meshes(world).any():
             # Shadows are blurred: round shapes may have corners in them.
             model.vis.quality.numslices, model.vis.quality.numstacks = 12, 6
             model.vis.global_.offwidth, model.vis.global_.offheight = self._shade
@@ -589,17 +588,12 @@ def _own(model: mujoco.MjModel, world: World) -> np.ndarray:
     return model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
 
 
-def _has_meshes(model: mujoco.MjModel, world: World) -> bool:
-    meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
-    return bool(np.any(_own(model, world) & meshes))
-
-
 def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
     """Axles of the hinges that lie in a ball or a capsule of their link.
 
     A robot drawn with meshes has its own.
     """
-    if _has_meshes(model, world):
+    if own_meshes(world).any():
         return []
     round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
     round_ones = _own(model, world) & np.isin(
@@ -659,11 +653,6 @@ def _dressed(world: World, size: tuple[int, int]) -> mujoco.MjModel:
     kinds = (mujoco.mjtGeom.mjGEOM_BOX.value, mujoco.mjtGeom.mjGEOM_MESH.value)
     boxes = (model.geom_bodyid == 0) & np.isin(model.geom_type, kinds)
     model.geom_rgba[boxes] = BOX_COLOUR
-    # Shapes that bear on something stand out of a robot's own meshes like balls; as
-    # pads of rubber they belong to it.
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
-    meshes = own & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
-    if np.any(meshes & np.isin(model.geom_group, SHOWN_GROUPS)):
-        pads = [g for s in world.surfaces.values() for g in s.geoms]
-        model.geom_matid[pads], model.geom_rgba[pads] = -1, PAD_COLOUR
+    pads = pads_of(world)
+    model.geom_matid[pads], model.geom_rgba[pads] = -1, PAD_COLOUR
     return model

@@ -42,7 +42,7 @@ from clamber.run.codec import whole_file
 from clamber.run.folder import PLAN, RUN_MAKERS, VERDICT, fallback_note
 from clamber.show.framing import PRESETS, box_corners, seen_points
 from clamber.show.marks import FORCE_LENGTH
-from clamber.show.meshes import Mesh, body_meshes, body_poses
+from clamber.show.meshes import Mesh, body_meshes, body_poses, pads_of
 from clamber.show.sample import (
     keyframe_times,
     read_run,
@@ -271,7 +271,7 @@ def _motion(
 ) -> dict[str, Any]:
     """What is animated and plotted of a run."""
     world = plan.world if rollout is None else rollout.world
-    meshes = body_meshes(world.model)
+    meshes = body_meshes(world.model, pads=pads_of(world))
     most = max(2, MAX_POSES // (28 * max(len(meshes), 1)))
     m = sample_motion(plan, rollout, execution, most, tell)
     series: dict[str, np.ndarray | None] = {

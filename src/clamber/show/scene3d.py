@@ -21,7 +21,7 @@ from clamber.model.se3 import frame_from_normal, quat_from_matrix
 from clamber.planning.records import Plan
 from clamber.show.framing import seen_points
 from clamber.show.marks import FORCE_LENGTH, PHASE_COLOURS
-from clamber.show.meshes import Mesh, body_meshes, body_poses
+from clamber.show.meshes import Mesh, body_meshes, body_poses, pads_of
 from clamber.show.page import paragraphs
 from clamber.show.sample import (
     change_at,
@@ -188,7 +188,10 @@ class Stage:
         add = server.scene
         self.root = add.add_frame(root, show_axes=False)
         meshes = body_meshes(
-            m.world.model, max_triangles=TRIANGLES, deviation=DEVIATION
+            m.world.model,
+            max_triangles=TRIANGLES,
+            deviation=DEVIATION,
+            pads=pads_of(m.world),
         )
         self._meshes = [x for x in meshes if x.body != 0]
         Bodies(add, f"{root}/scene", [x for x in meshes if x.body == 0])
@@ -257,6 +260,8 @@ class Stage:
             self._way.points = np.stack([way[:-1], way[1:]], axis=1)
         under_way = change_at(self.changes, self.reached, t)
         facts = [f"{t:.2f} of {self.duration:.1f} s; {under_way}"]
+        if t > self.duration:  # beside a longer run
+            facts = [f"{t:.2f} s; done after {self.duration:.1f} s"]
         if math.isfinite(m.margin[row]):
             facts.append(f"CoM margin {1000 * m.margin[row]:.0f} mm")
         pairs = zip(self._robust, self.reached, strict=True)

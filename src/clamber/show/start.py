@@ -26,7 +26,7 @@ from clamber.recording.detect import detect_contacts
 from clamber.recording.recording import load_demo
 from clamber.run.folder import new_run_folder, next_free_folder
 from clamber.show.framing import robot_corners
-from clamber.show.meshes import body_meshes, body_poses
+from clamber.show.meshes import body_meshes, body_poses, pads_of
 from clamber.show.page import Page, Work, paragraphs
 from clamber.show.scene3d import DEVIATION, PERSON_BOX, TRIANGLES, Bodies
 from clamber.show.track import EXECUTION, PLANNING
@@ -208,7 +208,12 @@ class StartPage:
             return
         kin = Kinematics(world)
         kin.update(world.home)
-        meshes = body_meshes(world.model, max_triangles=TRIANGLES, deviation=DEVIATION)
+        meshes = body_meshes(
+            world.model,
+            max_triangles=TRIANGLES,
+            deviation=DEVIATION,
+            pads=pads_of(world),
+        )
         self._preview.remove()
         self._count += 1
         add, name = self._page.server.scene, f"/start/{self._count}"
