@@ -272,7 +272,7 @@ def pelvis_distribution(
 
     Args:
         policy: The policy.
-        edges: Of the obstacle, as from `climbed_edges`.
+        edges: Edges of the obstacle, as from `climbed_edges`.
         position: (3,) of the pelvis in the world [m].
         near: Distance within which the pelvis is near an edge: a thigh's length [m].
 

@@ -60,19 +60,19 @@ class Step:
 
     Attributes:
         limb: Its name.
-        breaks: Surfaces that leave their contacts.
+        breaks: Surfaces whose contacts are broken.
         makes: The contact that is made, its position a reference until optimised.
-        fixed: The position is taken as it is, or as near as can be reached.
-        turns: Where nothing else helps, a flat surface may lie turned on its support.
+        fixed: The position is prescribed, or as near to it as can be reached.
+        turns: A flat surface may lie turned on its support where nothing else helps.
         target: The stance of the demonstration that it leads to.
-        stance: Its index in the sequence.
-        seeds: Where its postures may be found.
+        stance: Index of that stance in the sequence.
+        seeds: Postures from which its own may be found.
         base_rotation: (3, 3) R_WB of the pelvis that is preferred, or None.
         reference: (nq,) the posture to stay close to; None: the one before.
-        stands_up: To the posture that the robot starts in, which goes before these: it
-            is the last step, and ends on the feet. A person who has just got up is
-            bent, and so is a robot that held on till then.
-        index: Which step of its sequence it is; None: it is of none.
+        stands_up: It is the last step and ends on the feet, in the robot's nominal
+            posture, which then takes the place of reference and preferred rotation: a
+            person who has just got up is still bent.
+        index: Number of the step in its sequence; None: it belongs to none.
     """
 
     limb: str

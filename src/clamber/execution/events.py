@@ -14,7 +14,7 @@ class Event:
     in by `str`.
 
     Attributes:
-        time: Of the run [s].
+        time: Time in the run [s].
     """
 
     says: ClassVar[str]
@@ -47,10 +47,10 @@ class ContactMoved(Event):
     """A contact is not where it was planned.
 
     Attributes:
-        surface: That is in contact.
-        planned: That was planned to be; another one of the same limb, or the same.
-        above, aside: Off along the support's normal and across it.
-        made: It is just being made; otherwise it is part of the stance.
+        surface: The surface in contact.
+        planned: The surface that was planned: the same, or another of its limb.
+        above, aside: Deviation along the support's normal and across it [m].
+        made: The contact is just being made; else it is part of the stance.
     """
 
     surface: str

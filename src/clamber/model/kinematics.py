@@ -193,7 +193,7 @@ def limb_lengths(kin: Kinematics) -> dict[str, float]:
     """Segment lengths of the robot by the names of a subject's [m].
 
     Args:
-        kin: Of its world, in any posture.
+        kin: Kinematics of the robot's world, in any posture.
     """
     out: dict[str, list[float]] = {}
     for limb in kin.world.robot.limbs.values():

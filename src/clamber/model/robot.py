@@ -74,7 +74,7 @@ class RobotFile(_Strict):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Limb:
-    """A chain with its surfaces; `root` is the mass that its contacts support."""
+    """A kinematic chain with its surfaces; `root` is the mass that contacts support."""
 
     name: str
     root: str

@@ -69,7 +69,7 @@ def contact_alternatives(
 
     Args:
         sequence: As demonstrated.
-        robot: Whose limbs have the surfaces, or its name; others are nobody's.
+        robot: The robot whose limbs have the surfaces, or its name.
     """
     robot = load_robot(robot)
     differences = contact_differences(sequence)

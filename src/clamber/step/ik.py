@@ -69,10 +69,13 @@ class PostureProblem:
         clearance: (P,) least distance of each pair [m]; -inf where a pair does not
         count.
         balance: Keep the centre of mass over the loaded contacts.
-        balance_margin: [m] from the border of the support polygon.
+        balance_margin: Least distance of the centre of mass from the border of the
+            support polygon [m].
         com_target: (2,) preferred centre of mass; None is the middle of the polygon.
-        posture_weight, direction_weight, base_weight, com_weight: Of the soft tasks.
-        ellipse_weight: Of holding the centre of mass in the support ellipse (4.28).
+        posture_weight, direction_weight, base_weight, com_weight: Weights of the soft
+            tasks.
+        ellipse_weight: Weight of holding the centre of mass in the support ellipse
+            (4.28).
         lean: (surface, unit vector (3,) from its contact to the mass it will support,
             weight), the orientation of reach-to-support (4.27).
     """
@@ -170,8 +173,8 @@ def contact_clearance(
 
     Args:
         world: Robot and scene.
-        margin: Of all other pairs [m].
-        contacts: Support by surface.
+        margin: Clearance of all other pairs [m].
+        contacts: Support of each surface in contact.
         rolling: Flat surfaces on an edge, whose other edges may touch but not enter.
 
     Returns:

@@ -51,7 +51,7 @@ class KeyframeTask:
         directions: Demonstrated body segments, unit vectors in the world.
         q_reference: (nq,) the posture to stay close to where nothing else decides.
         base_rotation: (3, 3) preferred R_WB.
-        fixed: The new contacts' positions are not references but where they are.
+        fixed: The new contacts' positions are prescribed, not references.
     """
 
     held: tuple[Contact, ...]
@@ -73,15 +73,16 @@ class KeyframeOptions:
     Attributes:
         stability_weight: w of (4.25). Larger: contacts under the masses they support,
             farther from the demonstration.
-        reference_weight: Of the distance to the demonstrated contact (`direct`).
-        direction_weight: Of the demonstrated directions. Larger: looks more like the
-            person; too large: contacts are missed.
-        balance_margin: [m] the centre of mass stays this far inside the polygon.
-        robust: Only changes throughout which the `robust_margin` is positive.
+        reference_weight: Weight of the distance to the demonstrated contact (`direct`).
+        direction_weight: Weight of the demonstrated directions of body segments.
+            Larger: looks more like the person; too large: contacts are missed.
+        balance_margin: Least distance of the centre of mass from the border of the
+            support polygon [m].
+        robust: Accept only changes throughout which the `robust_margin` is positive.
         delta_stop: Stop when the cost changes by less (`lbfgs`, `gradient`).
         gradient_stop: Stop when the gradient's norm is below (`lbfgs`, `gradient`).
-        max_iterations: Cap of the outer iterations.
-        learning_rate: alpha of (4.23) (`gradient`).
+        max_iterations: Largest number of outer iterations.
+        learning_rate: Step size alpha of (4.23) (`gradient`).
     """
 
     stability_weight: float = STABILITY_WEIGHT

@@ -191,7 +191,7 @@ def run_climb(
 
     Args:
         climb: Recording, robot, scene and how.
-        folder: Where what each stage made is saved, as soon as it is made.
+        folder: Folder in which each stage's result is saved as soon as it is made.
         progress: Called with stage, share and note.
 
     Raises:

@@ -201,7 +201,7 @@ class Spec(_Strict):
     """The spec of a sweep: exactly one of `grid`, `random` and `search`.
 
     Attributes:
-        version: Of the format.
+        version: Version of the format.
         about: The question that it answers, in a sentence.
         seed: Run k of each series has `--disturb.seed seed + k`.
         controllers: Controllers that are compared; each does all runs.

@@ -440,7 +440,7 @@ def load_sweep(folder: str | Path) -> tuple[Spec, Rows]:
     """Spec and finished rows of a sweep, also of one that is not done.
 
     Args:
-        folder: That `run_sweep` writes.
+        folder: The folder that `run_sweep` writes.
 
     Raises:
         InputError: There is none.
