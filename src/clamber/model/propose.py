@@ -131,16 +131,16 @@ def propose_robot(
     path = Path(path)
     progress("robot", 0.0, f"reading {path}")
     description = read_description(path, lenient=True)
-    progress("robot", 0.2, "limbs")
+    progress("robot", 0.2, "finding its limbs")
     tree, found, notes = _upright(description, path)
     notes += _driven(tree, found, description.mimics, path)
-    progress("robot", 0.4, "shapes of its links")
+    progress("robot", 0.4, "fitting shapes to its links")
     shapes, more = link_shapes(tree)
     notes += more
     shapes, limbs = with_surfaces(tree, found, shapes)
     known = {} if effort_from is None else _known_efforts(Path(effort_from))
     effort, guessed = _efforts(tree, found, known)
-    progress("robot", 0.5, "nominal posture")
+    progress("robot", 0.5, "finding a nominal posture")
     home = nominal_posture(tree, found, effort)
     if guessed:
         notes.append(
@@ -170,7 +170,7 @@ def propose_robot(
             f"a hand supports {bears:.0f} N across its wrist: too little for compliant"
             " (self-positioning) ankles, so they stay stiff"
         )
-    progress("robot", 0.6, "its model")
+    progress("robot", 0.6, "writing its model")
     spec, files = build_spec(name, tree, found, shapes, apart, drives)
     spec.compile()
     return Proposal(
