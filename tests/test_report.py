@@ -429,6 +429,7 @@ def test_the_animation_plays_and_scrubs(page: tuple[Any, list[str]]):
     p.fill("input[type=range]", "1")
     assert p.evaluate("state.t") == 1
     assert p.inner_text("#clock").startswith("1.00 /")
+    assert p.evaluate("[-0.0002, -0.2].map(x => fixed(x, 1))") == ["0.0", "-0.2"]
     assert complaints == []
 
 

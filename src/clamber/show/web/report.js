@@ -23,7 +23,7 @@ function el(tag, attributes = {}, ...children) {
   return made;
 }
 
-const fixed = (x, digits) => (x === null || Number.isNaN(x) ? "–" : x.toFixed(digits));
+const fixed = (x, digits) => (x === null || Number.isNaN(x) ? "–" : x.toFixed(digits).replace(/^-(0\.?0*)$/, "$1"));
 const neat = (x) => {
   if (typeof x !== "number") return String(x ?? "–");
   const short = Number.isInteger(x) ? x : Number(x.toPrecision(4));
@@ -383,7 +383,7 @@ const PLOTS = [
   }],
   ["Joint tracking error [rad]", (run, m) => m.arrays.error && {
     lines: [{ name: "largest", colour: "#c2410c", at: (r) => m.arrays.error(r, 0) }, { name: "root mean square", colour: "#2563eb", at: (r) => m.arrays.error(r, 1) }], limits: [], floor: 0, digits: 3 }],
-  ["Base against the plan [m]", (run, m) => m.arrays.error && { lines: [{ name: "distance", colour: "#7c3aed", at: (r) => m.arrays.error(r, 2) }], limits: [], floor: 0, digits: 4 }],
+  ["Base position error [m]", (run, m) => m.arrays.error && { lines: [{ name: "distance", colour: "#7c3aed", at: (r) => m.arrays.error(r, 2) }], limits: [], floor: 0, digits: 4 }],
   ["Contact forces [N]", (run, m) => {
     if (!m.arrays.size) return null;
     const lines = m.surfaces.map((name, j) => ({ name, colour: colourOf(j), at: (r) => m.arrays.size(r, j) }));
