@@ -413,7 +413,12 @@ def highest(
     """Height of a support's highest point below the way from p1 to p2 (3,)."""
 
 def arc(
-    p1: np.ndarray, p2: np.ndarray, top: float, on_top: bool, points: int
+    p1: np.ndarray,
+    p2: np.ndarray,
+    top: float,
+    on_top: bool,
+    points: int,
+    scale: float = 1.0,
 ) -> np.ndarray:
     """Control points (n, 3) of the arc between two contact points (4.29)."""
 

@@ -66,6 +66,7 @@ struct Support {
 struct Model {
     int nq = 0, nv = 0, base = 0;
     double mass = 0.0;
+    double length_scale = 1.0;  // of planning's clearances and margins
     std::vector<Body> bodies;
     std::vector<Joint> joints;
     std::vector<Geom> geoms;

@@ -40,6 +40,7 @@ Model read_model(const nb::dict& d) {
     m.nv = nb::cast<int>(d["nv"]);
     m.base = nb::cast<int>(d["base"]);
     m.mass = nb::cast<double>(d["mass"]);
+    m.length_scale = nb::cast<double>(d["length_scale"]);
     const auto parent = column<int>(d, "body_parent");
     const auto body_pos = column<double>(d, "body_pos"), body_quat = column<double>(d, "body_quat");
     const auto mass = column<double>(d, "body_mass"), ipos = column<double>(d, "body_ipos");

@@ -60,10 +60,10 @@ SurfaceTask closed_task(const Model& model, const Contact& c) {
 }
 
 void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
-         std::vector<Vec3>& out) {
+         double scale, std::vector<Vec3>& out) {
     double apex =
-        std::max(0.5 * (p1.z + p2.z) + 0.5 * norm(p1 - p2), top + SAFE_HEIGHT);
-    if (on_top) apex = std::min(apex, std::max(p1.z, p2.z) + TOP_RISE + SAFE_HEIGHT);
+        std::max(0.5 * (p1.z + p2.z) + 0.5 * norm(p1 - p2), top + SAFE_HEIGHT * scale);
+    if (on_top) apex = std::min(apex, std::max(p1.z, p2.z) + TOP_RISE * scale + SAFE_HEIGHT * scale);
     // Parabola with the given maximum: z = z1 (1-s) + z2 s + 4 c s (1-s).
     const double a = apex - p1.z, b = apex - p2.z;
     double c = 0.0;
@@ -92,14 +92,14 @@ void PathPlanner::ask_balance(const std::vector<Contact>& loaded,
     p.posture_weight = posture_weight;
     p.ellipse_weight = ELLIPSE_WEIGHT;
     p.com_weight = COM_WEIGHT;
-    p.clearance.assign(model_.pairs.size(), CLEARANCE);
+    p.clearance.assign(model_.pairs.size(), CLEARANCE * model_.length_scale);
     const double nothing = -std::numeric_limits<double>::infinity();
     for (const auto* contacts : {&loaded, &unloaded}) {
         for (const Contact& c : *contacts) {
             p.tasks.push_back(closed_task(model_, c));
             p.tasks.back().loaded = contacts == &loaded;
             const auto& [planned, further] = model_.touching[c.surface][c.support];
-            for (const int i : further) p.clearance[i] = FURTHER_CLEARANCE;
+            for (const int i : further) p.clearance[i] = FURTHER_CLEARANCE * model_.length_scale;
             for (const int i : planned) p.clearance[i] = c.edge >= 0 ? 0.0 : nothing;
         }
     }
@@ -125,7 +125,7 @@ void PathPlanner::solve_node(const std::vector<double>& from,
 
 void PathPlanner::bridge(const std::vector<double>& a, const std::vector<double>& b,
                          const std::vector<Contact>& contacts, Postures& out) {
-    ask_balance(contacts, {}, BRIDGE_MARGIN, 1.0);
+    ask_balance(contacts, {}, BRIDGE_MARGIN * model_.length_scale, 1.0);
     problem_.ellipse_weight = problem_.com_weight = 0.0;
     difference(model_, a.data(), b.data(), tangent_.data());
     double way = 0.0;
@@ -149,14 +149,15 @@ void PathPlanner::bridge(const std::vector<double>& a, const std::vector<double>
 // touch-down the limb is as near to the supports as they are, and asking for the full
 // distance at once would tear it off them sideways.
 void PathPlanner::near_ends(const Transition& t) {
+    const double clearance = CLEARANCE * model_.length_scale;
     std::vector<unsigned char> counts(model_.pairs.size());
     for (std::size_t i = 0; i < counts.size(); ++i) counts[i] = std::isfinite(clearance_[i]);
     for (int k = 0; k < 2; ++k) {
         ends_[k].clear();
         solver.kin.update(k == 0 ? t.shifted.data() : t.touching.data());
         for (const auto& [pair, at] :
-             solver.near.query(solver.kin.geom_poses(), CLEARANCE, counts.data()))
-            ends_[k].push_back({pair, std::min(std::max(at.distance, 0.0), CLEARANCE)});
+             solver.near.query(solver.kin.geom_poses(), clearance, counts.data()))
+            ends_[k].push_back({pair, std::min(std::max(at.distance, 0.0), clearance)});
     }
 }
 
@@ -186,7 +187,7 @@ void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& contr
     const double ramp = std::min(1.0, std::min(ENDS * share, ENDS * (1.0 - share)));
     if (ramp < 1.0)
         for (const Eased& e : ends_[share < 0.5 ? 0 : 1]) {
-            const double eased = e.distance * (1.0 - ramp) + ramp * CLEARANCE;
+            const double eased = e.distance * (1.0 - ramp) + ramp * CLEARANCE * model_.length_scale;
             problem_.clearance[e.pair] = std::min(problem_.clearance[e.pair], eased);
         }
     solve_node(last, reference_, q);
@@ -205,7 +206,7 @@ void PathPlanner::swing(const Transition& t, Path& out) {
     for (const Contact& c : t.rolling)
         slides = slides || (c.surface == t.made.surface && c.support == t.made.support);
     arc(p1, t.made.position, highest(support, p1, t.made.position), slides, ARC_POINTS,
-        out.control);
+        model_.length_scale, out.control);
     ask_balance(t.held, {}, t.margin, 0.3);
     SurfaceTask reach = closed_task(model_, t.made);
     reach.kind = TaskKind::Reaching;

@@ -133,7 +133,7 @@ SurfaceTask closed_task(const Model& model, const Contact& c);
 // the way passes it by, or it is level.
 double highest(const Support& support, const Vec3& p1, const Vec3& p2);
 // Control points of the arc from p1 to p2 (4.29).
-void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
+void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points, double scale,
          std::vector<Vec3>& out);
 
 }  // namespace clamber

@@ -252,14 +252,17 @@ void bind_posture(nb::module_& m) {
           },
           "Height of a support's highest point below the way from p1 to p2.");
     m.def("arc",
-          [](const Array1<>& p1, const Array1<>& p2, double top, bool on_top, int points) {
+          [](const Array1<>& p1, const Array1<>& p2, double top, bool on_top, int points,
+             double scale) {
               check_size(p1.size() + p2.size(), 6, "ends");
               std::vector<Vec3> arc_points;
-              arc(read3(p1.data()), read3(p2.data()), top, on_top, points, arc_points);
+              arc(read3(p1.data()), read3(p2.data()), top, on_top, points, scale, arc_points);
               std::vector<double> out;
               for (const Vec3& p : arc_points) out.insert(out.end(), {p.x, p.y, p.z});
               return own(std::move(out), {arc_points.size(), 3});
           },
+          nb::arg("p1"), nb::arg("p2"), nb::arg("top"), nb::arg("on_top"), nb::arg("points"),
+          nb::arg("scale") = 1.0,
           "Control points of the arc between two contact points (4.29).");
 
     nb::class_<Problem>(m, "Problem", "What a posture must and should satisfy.")

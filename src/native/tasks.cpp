@@ -138,7 +138,7 @@ void Rows::at_most(double room, const Vec3& com) {
 void Rows::inside(int support, const Vec3& p, int body, const Vec3& moves, const Vec3* at) {
     const Support& s = model_.supports[support];
     for (std::size_t i = 0; i < s.A.size(); ++i) {
-        double border = s.b[i] - EDGE_INSET;
+        double border = s.b[i] - EDGE_INSET * model_.length_scale;
         if (at != nullptr) border = std::max(border, dot(s.A[i], *at));
         const double room = border - dot(s.A[i], p);
         if (!(room < EDGE_RANGE)) continue;
@@ -215,7 +215,7 @@ void Rows::contact(const Kinematics& kin, const SurfaceTask& task) {
                 inside(task.support, p, s.body, centre);
                 // As a task, room to slip before it is over the border.
                 for (std::size_t i = 0; i < on.A.size(); ++i) {
-                    const double room = on.b[i] - EDGE_ROOM - dot(on.A[i], p);
+                    const double room = on.b[i] - EDGE_ROOM * model_.length_scale - dot(on.A[i], p);
                     if (!(room < 0.0)) continue;
                     want(-room, EDGE_WEIGHT);
                     pull(s.body, centre, on.A[i] * EDGE_WEIGHT);

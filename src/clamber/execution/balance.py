@@ -50,8 +50,19 @@ class Balance:
             kin.data.xpos,
             kin.data.xmat,
             kin.com,
-            **{"high": HIGH, "fade": FADE, "sag": SAG, "p": P, "d": D, "t": T},
-            **{"most": MOST, "smoothing": RATE_SMOOTHING, "settled": SETTLED},
+            **{
+                "high": HIGH * world.length_scale,
+                "fade": FADE * world.length_scale,
+                "sag": SAG,
+                "p": P,
+                "d": D,
+                "t": T,
+            },
+            **{
+                "most": MOST * world.length_scale,
+                "smoothing": RATE_SMOOTHING,
+                "settled": SETTLED,
+            },
             period=period,
         )
         self._contacts: Sequence[Contact] = ()

@@ -24,6 +24,7 @@ from clamber.model.scene import GROUND, Scene
 from clamber.model.world import PHYSICS_STEP, World
 from clamber.planning.start import measured_contact
 
+# Of light robots, less: `World.force_scale`.
 TOUCH = 10.0  # [N] normal force that is a contact
 PRESSED = 4.0  # [N] ... where it was planned: six times the noise that is left of it
 LOST = 1.5  # [N] a contact of the stance that carries less is lost
@@ -44,12 +45,16 @@ class Estimate:
         filter: Of what is measured.
         q: (nq,) filtered posture.
         load: (nS, 3) filtered forces on the surfaces [N], world axes.
+        touch, pressed, lost: `TOUCH` and so on, of this robot [N].
     """
 
     def __init__(self, world: World, q: np.ndarray) -> None:
         """Begin in posture `q` (nq,), nothing loaded."""
         self.believe(world)
         self.surfaces = tuple(world.surfaces)
+        self.touch, self.pressed, self.lost = (
+            f * world.force_scale for f in (TOUCH, PRESSED, LOST)
+        )
         self.filter = _core.Filter(
             q.tolist(),
             len(self.surfaces),
@@ -67,11 +72,16 @@ class Estimate:
         """Take in the measurement of one physics step."""
         self.filter.update(m.q, m.force)
 
-    def expect(self, *contacts: Contact, force: float = TOUCH) -> None:
-        """Have a decision taken at once where a surface of these is pressed so [N]."""
+    def expect(self, *contacts: Contact, force: float | None = None) -> None:
+        """Have a decision taken at once where a surface of these is pressed so [N].
+
+        Args:
+            contacts: Of the surfaces.
+            force: None: `touch`.
+        """
         rows = [self.row(c.surface) for c in contacts]
         normals = [self.world.supports[c.support].normal for c in contacts]
-        self.filter.watch(rows, np.array(normals).reshape(-1, 3), force)
+        self.filter.watch(rows, np.array(normals).reshape(-1, 3), force or self.touch)
 
     def row(self, surface: str) -> int:
         """Of a surface in the forces."""
@@ -97,14 +107,14 @@ class Estimate:
 
     def touches(self, c: Contact, aside: float = NEAR) -> bool:
         """Force on the surface, not far from where its contact was planned."""
-        if self.force(c) < TOUCH:
+        if self.force(c) < self.touch:
             return False
         up, side = self.deviation(c)
         return side < aside and abs(up) < REACH + 0.02
 
     def is_in_place(self, c: Contact) -> bool:
         """Pressed as little as can be told, where the contact was planned."""
-        if self.force(c) < PRESSED:
+        if self.force(c) < self.pressed:
             return False
         up, side = self.deviation(c)
         return side < NEAR and abs(up) < DEVIATION
@@ -115,7 +125,7 @@ class Estimate:
         On the same support; or, if it need not be `there`, on another: a foot that is
         back on the ground.
         """
-        if self.force(c) >= LOST:
+        if self.force(c) >= self.lost:
             return None
         others = () if there else self.world.supports.keys() - {c.support}
         for surface in self.world.robot.limb_of(c.surface).surfaces:
@@ -130,14 +140,14 @@ class Estimate:
 
     def _bears(self, c: Contact) -> bool:
         """Whether a surface is loaded over that support."""
-        if self.force(c) < TOUCH:
+        if self.force(c) < self.touch:
             return False
         p, support = self.point(c), self.world.supports[c.support]
         return bool(support.inside(p)) and abs(support.height(p)) < REACH
 
     def is_lost(self, c: Contact) -> bool:
         """Neither the contact's surface nor another one of the limb is loaded."""
-        return self.force(c) < LOST and self.substitute(c) is None
+        return self.force(c) < self.lost and self.substitute(c) is None
 
     def _lies(self, c: Contact) -> bool:
         """Whether a surface lies on its support rather than touching with a corner.

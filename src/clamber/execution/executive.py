@@ -27,7 +27,7 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.contact.steps import split_steps
 from clamber.execution.balance import Balance
-from clamber.execution.estimate import DEVIATION, LOST, PRESSED, Estimate
+from clamber.execution.estimate import DEVIATION, Estimate
 from clamber.execution.events import (
     ContactMoved,
     Event,
@@ -115,7 +115,9 @@ class Executive:
         self._plan = plan
         self._report = progress
         self._balance = Balance(world, LOOK_STRIDE * PHYSICS_STEP)
-        self.watch = Watch(tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP)
+        self.watch = Watch(
+            tuple(world.surfaces), LOOK_STRIDE * PHYSICS_STEP, world.force_scale
+        )
         self._searches, self._pause = 0, pause
         self._back = 0.0  # [s] that a limb has been back on another support
         self.done = 0 if plan.state is None else plan.state.done
@@ -234,8 +236,9 @@ class Executive:
         if self._is_back():
             yield from self._go_on_from_here()
             return
-        loaded = [c for c in self.stance if self.estimate.force(c) >= LOST]
-        self.estimate.remember(loaded, self.done)
+        estimate = self.estimate
+        loaded = [c for c in self.stance if estimate.force(c) >= estimate.lost]
+        estimate.remember(loaded, self.done)
         yield from self._check_stance()
 
     def _settle(self, to: int) -> Reaction:
@@ -277,10 +280,10 @@ class Executive:
         def is_there() -> bool:
             return ref.i >= span.touch and self.estimate.is_in_place(c)
 
-        self.estimate.expect(c, force=PRESSED)
+        self.estimate.expect(c, force=self.estimate.pressed)
         yield from ref.play(late, until=is_there)
         # Without any load there, torques that count on it would throw the robot.
-        missing = self.estimate.force(c) < LOST
+        missing = self.estimate.force(c) < self.estimate.lost
         yield from ref.stop(until=is_there, push=span.touch if missing else None)
         self.estimate.expect()
         if is_there():
@@ -656,5 +659,5 @@ def _resting(estimate: Estimate, stance: Sequence[Contact]) -> Iterable[str]:
     for c in stance:
         for surface in estimate.world.robot.limb_of(c.surface).surfaces:
             other = replace(c, surface=surface)
-            if surface == c.surface or estimate.force(other) >= LOST:
+            if surface == c.surface or estimate.force(other) >= estimate.lost:
                 yield f"{surface}@{c.support}"

@@ -78,6 +78,6 @@ def follower(
         ankles,
         qadr=world.qadr.tolist(),
         period=LOOK_STRIDE,
-        touch=TOUCH,
+        touch=TOUCH * world.force_scale,
         shift_share=PHYSICS_STEP / SMOOTHING,
     )

@@ -45,7 +45,7 @@ def guarded_move(
     room = com_margin(load.com[:2], support_polygon(points.points[:, :2]))
     if room <= 0:
         return None
-    low, high = PROBE_MARGIN
+    low, high = (m * world.length_scale for m in PROBE_MARGIN)
     margins = (float(np.clip(room, low, high)), low)
     nodes, depths = nodes_below(ik, held, contact, q, free, margins)
     if len(nodes) == 1:

@@ -20,7 +20,7 @@ from clamber.model.world import PHYSICS_STEP, World
 ANGLE_NOISE = 5e-4  # [rad] rms of a joint encoder
 POSITION_NOISE = 2e-3  # [m] rms of the base
 ROTATION_NOISE = 3e-3  # [rad] rms of the base
-FORCE_NOISE = 2.0  # [N] rms of a contact force
+FORCE_NOISE = 2.0  # [N] rms of a contact force; less in robots that are light
 FORCE_SCALE_NOISE = 0.02  # share of the force, rms
 FORCE_STRIDE = 5  # physics steps between two readings of forces: 200 Hz
 BLOCK = 512  # steps whose noise is drawn at once
@@ -60,6 +60,7 @@ class Sensors:
             delay: From sensing to use [s]; whole physics steps.
             rng: Of the noise.
         """
+        self._force_noise = FORCE_NOISE * world.force_scale
         self._nq, self._surfaces = world.model.nq, len(world.surfaces)
         self._noise, self._rng, self._qadr = noise, rng, world.qadr
         self._k = 0
@@ -79,7 +80,7 @@ class Sensors:
         offset[:, self._qadr] = normal(0.0, ANGLE_NOISE, (BLOCK, len(self._qadr)))
         offset[:, :3] = normal(0.0, POSITION_NOISE, (BLOCK, 3))
         tilt = normal(0.0, ROTATION_NOISE, (BLOCK, 3))
-        pull = normal(0.0, FORCE_NOISE, (n, self._surfaces, 3))
+        pull = normal(0.0, self._force_noise, (n, self._surfaces, 3))
         gain = normal(0.0, FORCE_SCALE_NOISE, (n, self._surfaces))
         for x in offset, tilt, gain, pull:
             x *= self._noise

@@ -54,12 +54,16 @@ def load_is_missing(load: np.ndarray, weight: float) -> bool:
     return _core.load_is_missing(load, weight, MISSING)
 
 
-def hit_sideways(load: np.ndarray) -> list[int]:
-    """Which surfaces are pushed sideways more than upwards, forces (nS, 3) [N].
+def hit_sideways(load: np.ndarray, least: float = SIDEWAYS) -> list[int]:
+    """Which surfaces are pushed sideways more than upwards, and than `least` [N].
 
     No contact on a level support is loaded like that, at a friction of up to 1.
+
+    Args:
+        load: (nS, 3) forces on them [N].
+        least: As above.
     """
-    return _core.hit_sideways(load, SIDEWAYS)
+    return _core.hit_sideways(load, least)
 
 
 def loaded_link(
@@ -142,12 +146,15 @@ class Watch:
         alert: Supports have turned out to be uneven.
     """
 
-    def __init__(self, surfaces: Sequence[str], period: float) -> None:
+    def __init__(
+        self, surfaces: Sequence[str], period: float, force_scale: float = 1.0
+    ) -> None:
         """Look at the forces on `surfaces`, in order, every `period` [s]."""
         self.weight, self.alert = 0.0, False
         self.found: UnintendedContact | None = None
         self.clearance: dict[tuple[int, str], float] = {}
         self._surfaces, self._period = surfaces, period
+        self._sideways = SIDEWAYS * force_scale
         self._lasted, self._taken = 0.0, 0
         # Those that there is no way around.
         self._accepted: set[tuple[int, str]] = set()
@@ -207,7 +214,7 @@ class Watch:
         self, load: np.ndarray, in_use: Callable[[], Collection[str]]
     ) -> list[str]:
         """Surfaces, none of those in use, that hit a side."""
-        rows = hit_sideways(load)
+        rows = hit_sideways(load, self._sideways)
         if not rows:
             return []
         used = in_use()

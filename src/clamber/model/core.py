@@ -53,6 +53,7 @@ def _constants(world: World) -> dict[str, Any]:
         "nv": m.nv,
         "base": world.base,
         "mass": world.mass,
+        "length_scale": world.length_scale,
         "body_parent": _whole(m.body_parentid),
         "body_pos": _real(m.body_pos),
         "body_quat": _real(m.body_quat),

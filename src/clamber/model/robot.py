@@ -25,6 +25,9 @@ from clamber.model.wheels import MODELS, how_to_get
 ROBOTS = Path(__file__).parent / "robots"
 PROPOSED = Path("robots")  # below the current folder
 ROBOT_FILE = "robot.yaml"
+# [m] thigh and shank: of a robot with shorter legs (COMAN's are 0.427) the lengths that
+# planning keeps, such as clearances and margins, are in proportion to them.
+FULL_LEG = 0.42
 LIMBS = ("left_arm", "right_arm", "left_leg", "right_leg")
 
 
@@ -285,6 +288,12 @@ def _check_joints(
                 source,
                 f"effort.{name}",
             )
+
+
+def length_scale(hip: np.ndarray, knee: np.ndarray, ankle: np.ndarray) -> float:
+    """Factor on planning's lengths, at most 1, for a leg with joints there (3,) [m]."""
+    leg = float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))
+    return min(1.0, leg / FULL_LEG)
 
 
 def has_prefix(geom: str, prefix: str) -> bool:

@@ -28,17 +28,19 @@ from clamber.model.description import MESHES, coarser
 from clamber.model.facing import sole_points
 from clamber.model.limbs import DENSEST, Anatomy
 from clamber.model.records import short_repr
+from clamber.model.robot import length_scale
 from clamber.model.se3 import quat_from_matrix
 from clamber.model.tree import Chain, Tree, geom_points, geom_volume
 
 HEAVY = 1.0  # [kg] a link this heavy without collision shape gets one
-PAD = 0.006  # [m] balls stand out of their links: the link does not touch before them
+# [m] of the robot's size, as planning's clearance is:
+PAD = 0.006  # balls stand out of their links: the link does not touch before them
+TOUCHING = 0.02  # links two joints apart that are nearer are not kept apart
+ROOM = 0.01  # around links as the robot stands
 FLAT = 0.4  # a mesh flatter than this share of its width becomes a box
 NEAR = 0.05  # share of thigh or upper arm: as far past the joint its ball holds all
 FOREARM = 0.4  # share of the upper arm: shapes that reach less far are no forearm
 LEAST_BALL, LARGEST_BALL = 0.12, 0.3  # ... radius at knee and elbow
-TOUCHING = 0.02  # [m] links two joints apart that are nearer are not kept apart
-ROOM = 0.01  # [m] around links as the robot stands
 MAX_FRICTION = 1.0  # [N m] dry friction of a joint
 THINNER = 0.2  # share of its size
 ROUNDING = 2e-5  # share of a moment of inertia that is lost where it is written
@@ -191,16 +193,17 @@ def with_surfaces(
         InputError: A foot has no sole that is level at the zero posture.
     """
     model, limbs, shapes = tree.model, {}, list(shapes)
+    pad = PAD * _scale(tree, found)
     for name, chain in found.limbs.items():
         side, arm = name[0].upper(), name.endswith("arm")
         middle, end = int(tree.links[chain.middle]), int(tree.links[chain.end])
         outer, inner = (f"{side}{x}" for x in SURFACES["arm" if arm else "leg"])
         if arm:
-            own = [_hand(tree, outer, chain, shapes)]
+            own = [_hand(tree, outer, chain, shapes, pad)]
         else:
             own = [_sole(tree, outer, chain)]
             shapes = [s for s in shapes if not tree.hangs_on(s.link, end)]
-        own.append(_joint_ball(tree, inner, chain, shapes))
+        own.append(_joint_ball(tree, inner, chain, shapes, pad))
         prefix = {end: outer, middle: inner}
         shapes = [
             s
@@ -236,15 +239,19 @@ def _points_of(shapes: Sequence[Shape], links: set[int]) -> np.ndarray:
     return np.concatenate(points) if points else np.zeros((0, 3))
 
 
+def _scale(tree: Tree, found: Anatomy) -> float:
+    leg = found.limbs["left_leg"]
+    return length_scale(*(tree.data.xpos[b] for b in (leg.root, leg.middle, leg.end)))
+
+
 def _ball(name: str, link: int, centre: np.ndarray, radius: float) -> Shape:
-    """A ball that protrudes a little."""
-    return Shape(
-        name=name, link=link, kind=_SPHERE, size=(radius + PAD,), position=centre
-    )
+    return Shape(name=name, link=link, kind=_SPHERE, size=(radius,), position=centre)
 
 
-def _hand(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape:
-    """A ball at the far end of the hand, fingers and all."""
+def _hand(
+    tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape], pad: float
+) -> Shape:
+    """A ball at the far end of the hand, fingers and all, that protrudes by `pad`."""
     end, elbow = int(tree.links[chain.end]), tree.data.xanchor[chain.elbow]
     hand = {b for b in tree.links.tolist() if tree.hangs_on(b, end)}
     points = _points_of(shapes, hand)
@@ -269,10 +276,12 @@ def _hand(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape
     centre = elbow + middle + (float(along.max()) - radius) * u
     tip = points[along > along.max() - radius]
     radius = float(np.linalg.norm(tip - centre, axis=1).max())
-    return _ball(name, end, centre, radius)
+    return _ball(name, end, centre, radius + pad)
 
 
-def _joint_ball(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) -> Shape:
+def _joint_ball(
+    tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape], pad: float
+) -> Shape:
     """A ball around knee or elbow that holds all of the limb past it, on the near side.
 
     The forearm may be a link of its own, that turns past the elbow and is no part of
@@ -299,7 +308,7 @@ def _joint_ball(tree: Tree, name: str, chain: Chain, shapes: Sequence[Shape]) ->
     others = _points_of(shapes, past - {link}) - anchor
     depth = (others[others @ on < 0.5 * reach] @ beneath).max(initial=radius)
     middle = middle + (depth - radius) * beneath
-    return _ball(name, link, anchor + middle, radius)
+    return _ball(name, link, anchor + middle, radius + pad)
 
 
 def _sole(tree: Tree, name: str, chain: Chain) -> Shape:
@@ -378,6 +387,7 @@ def with_room(
     Returns:
         The shapes, names of links that are not kept apart, and of shapes made thinner.
     """
+    room, touching = ROOM * (scale := _scale(tree, found)), TOUCHING * scale
     spec, _ = build_spec("trial", tree, found, shapes, looks=False)
     trial = spec.compile()
     data = mujoco.MjData(trial)
@@ -399,18 +409,18 @@ def with_room(
                 links = trial.body(i).name, trial.body(j).name
                 names = trial.geom(a).name, trial.geom(b).name
                 gives = [n for n in names if n in links_only]
-                deepest = -ROOM
+                deepest = -room
                 if d <= 0.0 and balls.intersection(names):
                     gives, deepest = [n for n in names if n in links_only | balls], -1.0
                 won = sum(most[n] for n in gives)
-                limit = TOUCHING if two else min(0.0, max(deepest, ROOM - won))
+                limit = touching if two else min(0.0, max(deepest, room - won))
                 near.append((d, limit, links, gives))
     apart = {links: None for d, limit, links, _ in near if d <= limit}
     lack: dict[str, float] = {}
     for d, _, links, gives in near:
-        if links not in apart and d < ROOM:
+        if links not in apart and d < room:
             for n in gives:
-                lack[n] = max(lack.get(n, 0.0), (ROOM - d) / len(gives))
+                lack[n] = max(lack.get(n, 0.0), (room - d) / len(gives))
     out = []
     for s in shapes:
         less, n = min(lack.get(s.name, 0.0), most[s.name]), _sizes(s)

@@ -21,7 +21,14 @@ from clamber.errors import InputError
 from clamber.model.arguments import checks_types
 from clamber.model.description import read_description
 from clamber.model.records import short_repr
-from clamber.model.robot import Robot, RobotLike, has_prefix, load_robot, world_name
+from clamber.model.robot import (
+    Robot,
+    RobotLike,
+    has_prefix,
+    length_scale,
+    load_robot,
+    world_name,
+)
 from clamber.model.scene import GROUND, Mesh, Scene, Support
 from clamber.model.se3 import matrix_from_quat, quat_from_yaw
 from clamber.model.terrain import SceneLike, load_scene
@@ -35,6 +42,7 @@ UNEVEN = 0.012  # [m] what rises less from a support belongs to it
 GENTLE = 1.0  # tangent of the steepest rise beside a support that may be touched
 BENDS = (1.0, 0.75, 0.5, 0.25)  # shares of home's bend that legs stand with
 CLEAR = 0.002  # [m] that they keep from boxes at the start
+FULL_MASS = 20.0  # [kg] of a robot on which 10 N are little
 DEFAULT_ARMATURE = 0.05  # [kg m^2] where the description has none
 DEFAULT_DAMPING = 3.0  # [N m s/rad] where the description has none
 
@@ -100,6 +108,8 @@ class World:
             contact: those that define it, and those of the surface's further geoms.
         base: Id of the pelvis body.
         mass: Mass of the whole robot [kg].
+        length_scale: Factor on planning's clearances and margins, see
+            `robot.length_scale`.
     """
 
     model: mujoco.MjModel
@@ -125,6 +135,7 @@ class World:
     touching: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
     base: int
     mass: float
+    length_scale: float
 
     __repr__ = short_repr
 
@@ -132,15 +143,26 @@ class World:
         """A surface, or one edge of it where it has rolled onto that."""
         return self.surfaces[name] if edge is None else self.edges[name][edge]
 
+    @property
+    def force_scale(self) -> float:
+        """Of forces that are told from none: 1, less for robots below `FULL_MASS`."""
+        return min(1.0, self.mass / FULL_MASS)
+
     def landmark(self, name: str) -> tuple[int, np.ndarray]:
         """Body id and point (3,) in its frame of a body or, failing that, a geom."""
-        b = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
-        if b >= 0:
-            return b, np.zeros(3)
-        if name in self.surfaces:
-            return self.surfaces[name].body, self.surfaces[name].centre
-        g = self.model.geom(world_name(self.robot, name)).id
-        return int(self.model.geom_bodyid[g]), self.model.geom_pos[g].copy()
+        return _landmark(self.model, self.robot, self.surfaces, name)
+
+
+def _landmark(
+    model: mujoco.MjModel, robot: Robot, surfaces: Mapping[str, Surface], name: str
+) -> tuple[int, np.ndarray]:
+    b = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
+    if b >= 0:
+        return b, np.zeros(3)
+    if name in surfaces:
+        return surfaces[name].body, surfaces[name].centre
+    g = model.geom(world_name(robot, name)).id
+    return int(model.geom_bodyid[g]), model.geom_pos[g].copy()
 
 
 @checks_types
@@ -329,7 +351,7 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
     surfaces = {s: _surface(model, data, s) for s in robot.surfaces}
     pairs = _pairs(model, data, base)
     home = _stand_clear(model, data, robot, scene, home, surfaces, pairs)
-    supports = {s.name: s for s in scene.supports}
+    supports, leg = {s.name: s for s in scene.supports}, robot.limbs["left_leg"]
     geoms = _support_geoms(model, scene)
     names = {g: name for name, g in reversed(geoms.items())}
     return World(
@@ -365,6 +387,12 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         touching=_touching(model, scene, pairs, surfaces, geoms),
         base=base,
         mass=float(model.body_subtreemass[base]),
+        length_scale=length_scale(
+            *(
+                _place(model, data, robot, surfaces, n)
+                for n in (leg.root, leg.middle, leg.end)
+            )
+        ),
     )
 
 
@@ -425,6 +453,20 @@ def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
     return replace(out, centre=centre, rotation=rotation, corners=corners)
 
 
+def _place(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    robot: Robot,
+    surfaces: Mapping[str, Surface],
+    name: str,
+) -> np.ndarray:
+    """Where a landmark is, (3,)."""
+    body, point = _landmark(model, robot, surfaces, name)
+    if not point.any():
+        return data.xpos[body]
+    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ point
+
+
 def _stand(
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -435,15 +477,8 @@ def _stand(
 ) -> np.ndarray:
     """Put the ankles' midpoint at the start and the soles on the ground."""
     ends = [robot.limbs[n].end for n in ("left_leg", "right_leg")]
-    low, ankles = np.inf, []
-    for name in ends:
-        if (b := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0:
-            ankles.append(data.xpos[b])
-        elif foot := surfaces.get(name):
-            R_WB = data.xmat[foot.body].reshape(3, 3)
-            ankles.append(data.xpos[foot.body] + R_WB @ foot.centre)
-        else:
-            ankles.append(data.geom(world_name(robot, name)).xpos)
+    ankles = [_place(model, data, robot, surfaces, n) for n in ends]
+    low = np.inf
     for s in surfaces.values():
         z = data.xpos[s.body] + s.corners @ data.xmat[s.body].reshape(3, 3).T
         low = min(low, float(z[:, 2].min() - s.radius))

@@ -19,7 +19,7 @@ from clamber.planning.search import Search
 from clamber.step.change import Change, Failure
 from clamber.step.ik import IK
 from clamber.step.posture import Keyframe
-from clamber.step.transition import MARGINS, eased_contacts
+from clamber.step.transition import eased_contacts, margins_of
 
 # Factors on the weights of the keyframes, by what is tried first.
 VARIATIONS: tuple[Mapping[str, float], ...] = (
@@ -163,7 +163,7 @@ class _Line:
             done=(*self.done, self.k),
             changes=(*self.changes, change),
         )
-        if self.mended < MAX_REPAIRS and change.margin < MARGINS[0]:
+        if self.mended < MAX_REPAIRS and change.margin < margins_of(search.ik.world)[0]:
             return line._roomier(search) or line
         return line
 
@@ -198,8 +198,9 @@ class _Line:
         """
         last = self.steps[self.done[-1]]
         before = replace(self, changes=self.changes[:-1]).route
-        least = [*(c.margin for c in before.changes), MARGINS[0]]
-        for places, seeds in repairs(search.ik, before, last, margin=MARGINS[0]):
+        wide = margins_of(search.ik.world)[0]
+        least = [*(c.margin for c in before.changes), wide]
+        for places, seeds in repairs(search.ik, before, last, margin=wide):
             j, steps = min(places), list(self.steps)
             steps[self.done[-1]] = replace(last, seeds=seeds)
             for i, contact in places.items():
@@ -227,7 +228,7 @@ def _placed(step: Step, contact: Contact) -> Step:
 
 
 def repairs(
-    ik: IK, route: Route, step: Step, *, margin: float = MARGINS[-1]
+    ik: IK, route: Route, step: Step, *, margin: float | None = None
 ) -> Iterator[tuple[dict[int, Contact], Seeds]]:
     """Which earlier changes should have made their contacts elsewhere for `step`.
 

@@ -257,7 +257,7 @@ def quadrupedal_posture(ik: IK, gait: Gait) -> np.ndarray:
     problem = PostureProblem(
         tasks=tuple(closed(world, c) for c in contacts),
         q_reference=world.home,
-        clearance=np.where(own, CLEARANCE, -np.inf),
+        clearance=np.where(own, CLEARANCE * world.length_scale, -np.inf),
         base_rotation=held,
     )
     return ik.solve_hard(problem, q).q
@@ -277,7 +277,7 @@ def upright_posture(ik: IK, key: Keyframe, new: Contact) -> np.ndarray:
     problem = PostureProblem(
         tasks=tuple(closed(world, c) for c in stance),
         q_reference=key.q,
-        clearance=contact_clearance(world, CLEARANCE, where),
+        clearance=contact_clearance(world, CLEARANCE * world.length_scale, where),
         com_target=middle_of(world, stance),
         com_weight=OVER_MIDDLE,
     )

@@ -337,7 +337,7 @@ def render_run(
     if rollout is not None:
         motion = sample_motion(plan, rollout, {}, SAMPLES)
         tell("pictures", plots / 2 / whole, "plots")
-        asked = plan.options.keyframe.balance_margin
+        asked = plan.options.keyframe.balance_margin * plan.world.length_scale
         files.append(contact_plot(motion, folder / "contacts.png"))
         files.append(stability_plot(motion, asked, folder / "stability.png"))
     if plan.iterations:

@@ -320,7 +320,7 @@ def _motion(
         ],
         "joints": list(world.joints),
         "effortLimits": world.tau_max,
-        "marginAsked": plan.options.keyframe.balance_margin,
+        "marginAsked": plan.options.keyframe.balance_margin * world.length_scale,
         "schedule": m.schedule,
         "loads": m.loads,
         "events": m.events,

@@ -29,8 +29,8 @@ from clamber.step.robust import robust_margin_along
 from clamber.step.stability import limiting_joint, out_of_reach
 from clamber.step.tasks import support_rotation
 from clamber.step.transition import (
-    MARGINS,
     approach_contact,
+    margins_of,
     plan_transition,
     rolled,
 )
@@ -257,7 +257,10 @@ def _change(
             detail = out_of_reach(ik.kin, key.q, step.makes, pair)
         return Failure(status=key.status, step=step, detail=detail)
     status, detail = key.status, ""
-    for margin in (MARGINS[0], ROBUST_BALANCE) if options.robust else MARGINS:
+    margins = margins_of(ik.world)
+    if options.robust:
+        margins = (max(margins[0], ROBUST_BALANCE), ROBUST_BALANCE)
+    for margin in margins:
         transition = plan_transition(ik, before, key, step, margin=margin)
         status, detail = transition.status, transition.note
         if status is not Status.SOLVED:

@@ -179,12 +179,12 @@ def contact_clearance(
 
     Returns:
         (P,): the planning geom of a contact pair is left to the contact task; further
-        geoms of the surface keep `FURTHER_CLEARANCE`.
+        geoms of the surface keep `FURTHER_CLEARANCE`, of the robot's size.
     """
     out = np.full(len(world.pairs), margin)
     for surface, support in contacts.items():
         planned, further = world.touching[surface, support]
-        out[further] = FURTHER_CLEARANCE
+        out[further] = FURTHER_CLEARANCE * world.length_scale
         out[planned] = 0.0 if surface in rolling else -np.inf
     return out
 

@@ -162,8 +162,9 @@ class Alternation:
         self.before = _cost_at_references(ik, task, q, options)
         self.lowest, self.best = np.inf, np.zeros(0)
         corners = [s.polygon for s in self.supports]
-        self.lower = np.array([p.min(axis=0) + EDGE_INSET for p in corners]).ravel()
-        self.upper = np.array([p.max(axis=0) - EDGE_INSET for p in corners]).ravel()
+        inset = EDGE_INSET * ik.world.length_scale
+        self.lower = np.array([p.min(axis=0) + inset for p in corners]).ravel()
+        self.upper = np.array([p.max(axis=0) - inset for p in corners]).ravel()
 
     def start(self) -> np.ndarray:
         """(2n,) the references, in their supports' planes, inside their bounds."""

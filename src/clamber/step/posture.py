@@ -77,7 +77,7 @@ class KeyframeOptions:
         direction_weight: Weight of the demonstrated directions of body segments.
             Larger: looks more like the person; too large: contacts are missed.
         balance_margin: Least distance of the centre of mass from the border of the
-            support polygon [m].
+            support polygon [m]; of a robot with short legs less, in proportion.
         robust: Accept only changes throughout which the `robust_margin` is positive.
         delta_stop: Stop when the cost changes by less (`lbfgs`, `gradient`).
         gradient_stop: Stop when the gradient's norm is below (`lbfgs`, `gradient`).
@@ -134,11 +134,15 @@ def keyframe_problem(
     return PostureProblem(
         tasks=(*(closed(world, c) for c in task.held), *new),
         q_reference=task.q_reference,
-        clearance=contact_clearance(world, CLEARANCE, where, rolling),
+        clearance=contact_clearance(
+            world, CLEARANCE * world.length_scale, where, rolling
+        ),
         directions=task.directions,
         direction_weight=options.direction_weight,
         base_rotation=task.base_rotation,
-        balance_margin=max(options.balance_margin, ROBUST_BALANCE * options.robust),
+        balance_margin=max(
+            options.balance_margin * world.length_scale, ROBUST_BALANCE * options.robust
+        ),
     )
 
 

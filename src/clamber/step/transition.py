@@ -37,8 +37,9 @@ from clamber.step.tasks import (
     sliding,
 )
 
-MARGINS = (0.045, 0.025)  # [m] of the centre of mass while a contact moves: the first
-# that can be kept
+# [m] of the centre of mass while a contact moves, of the robot's size: the first that
+# can be kept.
+MARGINS = (0.045, 0.025)
 # As the core asks for the postures of a change: of the polygon's middle, of (4.28).
 COM_WEIGHT: float = _core.COM_WEIGHT
 ELLIPSE_WEIGHT: float = _core.ELLIPSE_WEIGHT
@@ -85,6 +86,11 @@ class Transition:
         return tuple(c for c in self.stance if c.surface in self.step.breaks)
 
 
+def margins_of(world: World) -> tuple[float, ...]:
+    """`MARGINS` of a robot [m], the first one the widest."""
+    return tuple(m * world.length_scale for m in MARGINS)
+
+
 def rolled(ik: IK, q: np.ndarray, c: Contact, towards: np.ndarray) -> Contact:
     """A flat contact on the edge that lies farthest `towards` (3,); others as they are.
 
@@ -111,7 +117,7 @@ def balance_problem(
     extra: tuple[SurfaceTask, ...] = (),
     posture_weight: float = 0.08,
     touching: Mapping[str, str] | None = None,
-    margin: float = MARGINS[-1],
+    margin: float | None = None,
 ) -> PostureProblem:
     """Balance on `held`, with `unloaded` in contact but not loaded.
 
@@ -123,7 +129,8 @@ def balance_problem(
         extra: Further tasks.
         posture_weight: Of the preferred posture.
         touching: Support by surface, of what may touch besides.
-        margin: Of the centre of mass to the border of its polygon [m].
+        margin: Of the centre of mass to the border of its polygon [m]; None: the
+            least of `MARGINS`.
     """
     where = {c.surface: c.support for c in (*held, *unloaded)} | dict(touching or {})
     rolling = [c.surface for c in (*held, *unloaded) if c.edge is not None]
@@ -134,8 +141,10 @@ def balance_problem(
             *extra,
         ),
         q_reference=q_reference,
-        clearance=contact_clearance(world, CLEARANCE, where, rolling),
-        balance_margin=margin,
+        clearance=contact_clearance(
+            world, CLEARANCE * world.length_scale, where, rolling
+        ),
+        balance_margin=margins_of(world)[-1] if margin is None else margin,
         posture_weight=posture_weight,
         ellipse_weight=ELLIPSE_WEIGHT,
         com_weight=COM_WEIGHT,
@@ -203,7 +212,7 @@ def eased_contacts(
     step: Step,
     surfaces: Collection[str],
     *,
-    margin: float = MARGINS[-1],
+    margin: float | None = None,
 ) -> tuple[tuple[Contact, ...], Seeds] | None:
     """Where earlier contacts should have been for a step to be feasible.
 
@@ -215,7 +224,8 @@ def eased_contacts(
         before: Keyframe it starts from.
         step: That does not work.
         surfaces: Whose contacts are free.
-        margin: Of the centre of mass to the border of its polygon [m].
+        margin: Of the centre of mass to the border of its polygon [m]; None: the
+            least of `MARGINS`.
 
     Returns:
         The contacts at their better places, and the posture found with them; None where
