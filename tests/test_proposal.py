@@ -14,13 +14,13 @@ import yaml
 import humanoids
 from clamber.errors import InputError
 from clamber.model.description import compile_description, read_description
+from clamber.model.drives import effort_of
 from clamber.model.kinematics import Kinematics
 from clamber.model.limbs import find_limbs
 from clamber.model.propose import (
     FOREARM,
     UPPER_ARM,
     Proposal,
-    effort_of,
     propose_robot,
 )
 from clamber.model.robot import Robot, load_robot

@@ -12,21 +12,20 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import mujoco
 import numpy as np
-import pydantic
 import yaml
 from scipy.optimize import least_squares
 
-from clamber.errors import InputError, read_yaml, validated
+from clamber.errors import InputError
 from clamber.model.arguments import checks_types
 from clamber.model.description import (
     Description,
     compile_description,
     read_description,
 )
+from clamber.model.drives import braked, efforts, gains_of, hand_load, known_efforts
 from clamber.model.facing import mirrored_turns, said_of_ahead
 from clamber.model.limbs import Anatomy, find_limbs
 from clamber.model.progress import Progress, silent
@@ -38,8 +37,6 @@ from clamber.model.se3 import (
     rotation_vector,
 )
 from clamber.model.shapes import (
-    MAX_FRICTION,
-    Shape,
     build_spec,
     link_shapes,
     plain,
@@ -66,20 +63,8 @@ _UPS = {
 # Directions of upper arm and forearm of the nominal left arm: x forward, y left.
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
 ANKLE_SHARE = 0.5  # of the ankles' effort, at most, that the nominal posture asks for
-LIMIT_ROOM = 0.05  # [rad] that the nominal posture keeps from joint limits
-# Gains and inertia of a joint by the robot's weight times height, as the built-in
-# robot's are.
-REFERENCE_MOMENT = 28.9 * 0.512  # [kg m] mass times height of its centre of mass
-REFERENCE_INERTIA = 28.9 * 0.512**2  # [kg m^2]
-REFERENCE_KP, REFERENCE_KD, REFERENCE_KI = 600.0, 20.0, 9.0
-ARMATURE, DAMPING = 0.05, 3.0  # of a joint whose description has none
-WEAK = 0.05  # share of weight times height: weaker joints have low gains
-WEAK_KP, WEAK_KD, WEAK_ARMATURE, WEAK_DAMPING = 1 / 3, 0.1, 0.1, 0.01
-MAX_ARMATURE, MAX_DAMPING = 0.3, 5.0
-COMPLIANT_KP, COMPLIANT_KD = 0.31, 0.8  # of the stiff gains: trunk, knees, elbows
 HAND_SHARE = 0.25  # of the weight, that a hand bears for ankles to position themselves
-GUESSED_EFFORT = {"leg": 0.8, "trunk": 0.6, "arm": 0.25}  # of weight times thigh
-_Efforts = dict[str, Annotated[float, pydantic.Field(gt=0)]]
+LIMIT_ROOM = 0.05  # [rad] that the nominal posture keeps from joint limits
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -138,8 +123,8 @@ def propose_robot(
     shapes, more = link_shapes(tree)
     notes += more
     shapes, limbs = with_surfaces(tree, found, shapes)
-    known = {} if effort_from is None else _known_efforts(Path(effort_from))
-    effort, guessed = _efforts(tree, found, known)
+    known = {} if effort_from is None else known_efforts(Path(effort_from))
+    effort, guessed = efforts(tree, found, known)
     progress("robot", 0.5, "finding a nominal posture")
     home = nominal_posture(tree, found, effort)
     if guessed:
@@ -158,9 +143,9 @@ def propose_robot(
         )
     if thin:
         notes.append(f"thinner, for room beside other links: {', '.join(thin)}")
-    gains, drives, impedance = _gains(tree, found, effort)
-    notes += _braked(tree, found)
-    bears = _hand_load(tree, found, shapes, effort)
+    gains, drives, impedance = gains_of(tree, found, effort)
+    notes += braked(tree, found)
+    bears = hand_load(tree, found, shapes, effort)
     ankles = []
     if bears >= HAND_SHARE * float(tree.model.body_subtreemass[found.base]) * 9.81:
         legs = found.pair("leg")
@@ -555,9 +540,6 @@ def _solve_arm(
     q[address] = min(solved, key=lambda s: s.cost).x
 
 
-# Limits and gains.
-
-
 def _from_wheel(name: str) -> tuple[Path, Path | None]:
     """Model, and effort limits that it may lack, of an installed wheel.
 
@@ -568,124 +550,3 @@ def _from_wheel(name: str) -> tuple[Path, Path | None]:
     if found is None:
         raise InputError(f"its model, by {how_to_get(name)}", "robot", None, name)
     return found
-
-
-def _known_efforts(path: Path) -> dict[str, float]:
-    """Effort limits by joint of a YAML mapping or of another description."""
-    if path.suffix in (".yaml", ".yml", ".json"):
-        return validated(_Efforts, read_yaml(path), path)
-    description = read_description(path, lenient=True)
-    description.spec.compiler.boundmass = 1e-3
-    description.spec.compiler.boundinertia = 1e-6
-    model = compile_description(description, path)
-    limits = {model.joint(j).name: effort_of(model, j) for j in range(model.njnt)}
-    return {n: x for n, x in limits.items() if x is not None}
-
-
-def _efforts(
-    tree: Tree, found: Anatomy, known: Mapping[str, float]
-) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Largest torque of each joint [N m], and the joints for which it is a guess."""
-    model, leg = tree.model, found.limbs["left_leg"]
-    mass = float(model.body_subtreemass[found.base])
-    thigh = float(np.linalg.norm(tree.data.xpos[leg.root] - tree.data.xpos[leg.middle]))
-    part = {j: n.split("_")[1] for n, c in found.limbs.items() for j in c.joints}
-    out, guessed = {}, []
-    for j in found.moving:
-        name = tree.name(j)
-        limit = known.get(name, effort_of(model, j))
-        if limit is None:
-            limit = GUESSED_EFFORT[part.get(j, "trunk")] * mass * 9.81 * thigh
-            guessed.append(name)
-        out[name] = float(f"{limit:.4g}")
-    return out, tuple(guessed)
-
-
-def effort_of(model: mujoco.MjModel, joint: int) -> float | None:
-    """Largest torque of a joint by its description [N m]; None where it has none."""
-    found = []
-    if model.jnt_actfrclimited[joint]:
-        found.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
-    on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    for a in np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint)):
-        gear = abs(float(model.actuator_gear[a, 0]))
-        direct = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
-        if model.actuator_forcelimited[a]:
-            found.append(gear * float(np.abs(model.actuator_forcerange[a]).max()))
-        elif model.actuator_ctrllimited[a] and direct:
-            gain = gear * abs(float(model.actuator_gainprm[a, 0]))
-            most = float(np.abs(model.actuator_ctrlrange[a]).max())
-            if gain != 1.0 or most != 1.0:  # else a share, of nobody knows what
-                found.append(gain * most)
-    return min((x for x in found if x > 0), default=None)
-
-
-def _hand_load(
-    tree: Tree, found: Anatomy, shapes: Sequence[Shape], effort: Mapping[str, float]
-) -> float:
-    """Force that each hand carries in every orientation of its wrist [N]."""
-    data, balls = tree.data, {s.name: s for s in shapes if s.surface}
-    out = np.inf
-    for side, chain in zip("LR", found.pair("arm"), strict=True):
-        ball = balls[f"{side}Hand"]
-        for j in chain.joints[chain.bend + 1 :]:
-            arm = np.cross(data.xaxis[j], ball.position - data.xanchor[j])
-            lever = max(float(np.linalg.norm(arm)), ball.size[0])
-            out = min(out, effort[tree.name(j)] / lever)
-    return float(out)
-
-
-def _two_digits(x: float) -> float:
-    return float(f"{x:.2g}")
-
-
-def _braked(tree: Tree, found: Anatomy) -> list[str]:
-    """What is said where joints of the description are braked more than joints are."""
-    model, dofs = tree.model, tree.model.jnt_dofadr[list(found.moving)]
-    brakes = (
-        (model.dof_damping[dofs], MAX_DAMPING, "N m s/rad of damping"),
-        (model.dof_frictionloss[dofs], MAX_FRICTION, "N m of dry friction"),
-        (model.dof_armature[dofs], MAX_ARMATURE, "kg m^2 of armature"),
-    )
-    return [
-        f"{(values > most).sum()} joints of the description have up to"
-        f" {values.max():g} {unit}, as simulations do: {most:g} are taken"
-        for values, most, unit in brakes
-        if values.max() > most
-    ]
-
-
-def _gains(
-    tree: Tree, found: Anatomy, effort: Mapping[str, float]
-) -> tuple[dict, dict[int, tuple[float, float]], dict]:
-    """Gains, (armature, damping) where the description has none, impedances."""
-    model, data = tree.model, tree.data
-    mass = float(model.body_subtreemass[found.base])
-    soles = [tree.points(int(tree.links[c.end])) for c in found.pair("leg")]
-    lowest = min(float(p[:, 2].min()) for p in soles)
-    height = float(data.subtree_com[found.base][2]) - lowest
-    stiff = mass * height / REFERENCE_MOMENT
-    inertia = mass * height**2 / REFERENCE_INERTIA
-    kp, ki = REFERENCE_KP * stiff, REFERENCE_KI * stiff
-    kd = REFERENCE_KD * np.sqrt(stiff * inertia)
-
-    def rounded(**gains: float) -> dict[str, float]:
-        return {n: _two_digits(x) for n, x in gains.items()}
-
-    gains, drives = {"default": rounded(kp=kp, kd=kd, ki=ki)}, {}
-    for j in found.moving:
-        name, d = tree.name(j), int(model.jnt_dofadr[j])
-        armature, damping = float(model.dof_armature[d]), float(model.dof_damping[d])
-        light_armature = light_damping = 1.0
-        if effort[name] < WEAK * mass * 9.81 * height:
-            gains[name] = rounded(kp=WEAK_KP * kp, kd=WEAK_KD * kd, ki=WEAK_KD * ki)
-            light_armature, light_damping = WEAK_ARMATURE, WEAK_DAMPING
-        if armature <= 0:
-            armature = _two_digits(ARMATURE * inertia * light_armature)
-        if damping <= 0:
-            damping = _two_digits(DAMPING * inertia * light_damping)
-        drives[j] = (min(armature, MAX_ARMATURE), min(damping, MAX_DAMPING))
-    soft = [c.elbow for c in found.limbs.values()]
-    soft += [j for j in found.trunk if abs(float(data.xaxis[j, 1])) < 0.7]
-    compliant = rounded(kp=COMPLIANT_KP * kp, kd=COMPLIANT_KD * kd)
-    return gains, drives, {tree.name(j): dict(compliant) for j in sorted(soft)}
