@@ -452,7 +452,8 @@ def read_shapes(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             points = np.concatenate([np.zeros((0, 3)), *clouds])
             if clouds and len(clouds) == len(scene.geometry):
                 return np.zeros((0, 3, 3)), points, upright
-            corners = scale * np.asarray(scene.to_mesh().triangles)
+            triangles = np.asarray(scene.to_mesh().triangles)
+            corners = scale * triangles.reshape(-1, 3, 3)  # (0, 3) where there is none
     except InputError:
         raise
     except Exception as e:  # the libraries raise whatever they trip over
