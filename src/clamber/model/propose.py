@@ -64,6 +64,7 @@ _UPS = {
 UPPER_ARM, FOREARM = (-0.355, 0.456, -0.816), (0.737, -0.223, -0.638)
 ANKLE_SHARE = 0.5  # of the ankles' effort, at most, that the nominal posture asks for
 HAND_SHARE = 0.25  # of the weight, that a hand bears for ankles to position themselves
+MIRRORED = 0.1  # of an upper arm: elbows that are no farther from mirror images
 LIMIT_ROOM = 0.05  # [rad] that the nominal posture keeps from joint limits
 
 
@@ -496,14 +497,22 @@ def _solve_leg(
 
 def _solve_arms(tree: Tree, q: np.ndarray, left: Chain, right: Chain) -> None:
     """Put the arms' angles into `q`: mirror images, where their joints are."""
-    model = tree.model
-    _solve_arm(tree, q, left, 1.0, _ways_to_begin(model, left))
+    model, one = tree.model, np.ones(len(left.joints))
     turns = mirrored_turns(tree, left, right, np.array([1.0, 0.0, 0.0]))
+    a, b = (tree.data.xanchor[c.elbow] for c in (left, right))
+    upper = float(np.linalg.norm(a - tree.data.xpos[left.root]))
+    if turns is not None and np.linalg.norm(a - b * [1, -1, 1]) > MIRRORED * upper:
+        # A description has a hinge anywhere on its axis.
+        both = [(left, 1.0, one), (right, -1.0, turns)]
+        _solve_arms_alike(tree, q, both, _ways_to_begin(model, left))
+        return
+    _solve_arms_alike(tree, q, [(left, 1.0, one)], _ways_to_begin(model, left))
     starts = _ways_to_begin(model, right)
     if turns is not None:
         mirrored = turns * q[model.jnt_qposadr[list(left.joints)]]
         starts = [np.clip(mirrored, *_bounds(model, right.joints))]
-    _solve_arm(tree, q, right, -1.0, starts)
+    one = np.ones(len(right.joints))
+    _solve_arms_alike(tree, q, [(right, -1.0, one)], starts)
 
 
 def _ways_to_begin(model: mujoco.MjModel, arm: Chain) -> list[np.ndarray]:
@@ -515,29 +524,46 @@ def _ways_to_begin(model: mujoco.MjModel, arm: Chain) -> list[np.ndarray]:
     return [straight, bent]
 
 
-def _solve_arm(
-    tree: Tree, q: np.ndarray, chain: Chain, side: float, starts: Sequence[np.ndarray]
+def _solve_arms_alike(
+    tree: Tree,
+    q: np.ndarray,
+    arms: Sequence[tuple[Chain, float, np.ndarray]],
+    starts: Sequence[np.ndarray],
 ) -> None:
-    """Put an arm's angles into `q`; `side` is 1 on the left, -1 on the right."""
+    """Put the angles of one arm, or of both, into `q`.
+
+    Args:
+        tree: The description.
+        q: (nq,) changed here.
+        arms: Each with 1 on the left or -1 on the right, and the turns (J,) that its
+            angles are of those that are solved for.
+        starts: (J,) to solve from.
+    """
     model, data = tree.model, mujoco.MjData(tree.model)
-    mirror = np.array([1.0, side, 1.0])
-    upper, fore = np.array(UPPER_ARM) * mirror, np.array(FOREARM) * mirror
-    address = model.jnt_qposadr[list(chain.joints)]
-    wrist = np.arange(len(chain.joints)) > chain.bend
+    first = arms[0][0]
+    wrist = np.arange(len(first.joints)) > first.bend
+
+    def put(x: np.ndarray, into: np.ndarray) -> None:
+        for chain, _, turns in arms:
+            into[model.jnt_qposadr[list(chain.joints)]] = turns * x
 
     def error(x: np.ndarray) -> np.ndarray:
         data.qpos[:] = q
-        data.qpos[address] = x
+        put(x, data.qpos)
         mujoco.mj_kinematics(model, data)
-        shoulder, at = data.xpos[chain.root], data.xanchor[chain.elbow]
-        far = tree.far(chain, data)
-        a = (at - shoulder) / np.linalg.norm(at - shoulder)
-        b = (far - at) / np.linalg.norm(far - at)
-        return np.concatenate([a - upper, b - fore, np.where(wrist, 0.3, 0.03) * x])
+        out = []
+        for chain, side, _ in arms:
+            mirror = np.array([1.0, side, 1.0])
+            shoulder, at = data.xpos[chain.root], data.xanchor[chain.elbow]
+            far = tree.far(chain, data)
+            a = (at - shoulder) / np.linalg.norm(at - shoulder)
+            b = (far - at) / np.linalg.norm(far - at)
+            out += [a - np.array(UPPER_ARM) * mirror, b - np.array(FOREARM) * mirror]
+        return np.concatenate([*out, np.where(wrist, 0.3, 0.03) * x])
 
-    bounds = _bounds(model, chain.joints)
+    bounds = _bounds(model, first.joints)
     solved = [least_squares(error, x, bounds=bounds) for x in starts]
-    q[address] = min(solved, key=lambda s: s.cost).x
+    put(min(solved, key=lambda s: s.cost).x, q)
 
 
 def _from_wheel(name: str) -> tuple[Path, Path | None]:
