@@ -120,14 +120,9 @@ class Executive:
         )
         self._searches, self._pause = 0, pause
         self._back = 0.0  # [s] that a limb has been back on another support
-        self.done = 0 if plan.state is None else plan.state.done
-        # A policy reads what comes next off the stance: it has no steps to count.
-        by_policy = plan.policy is not None
-        steps = [] if by_policy else split_steps(plan.sequence, plan.world)[0]
-        self._steps = len(steps)
-        self._begun = self.done
         # [s] when each keyframe of the plan was reached
         self._reached = [float(plan.trajectory.keyframes[0])]
+        self._count_by(plan)
         self.events: list[Event] = []
         self.stopped = ""
         self.estimate = Estimate(plan.world, plan.trajectory.q[0])
@@ -540,7 +535,7 @@ class Executive:
         )
         scene = estimate.scene(self._plan.world.scene)
         clearance = self.watch.clearance
-        found = rest_of(self._plan, scene, now, off, clearance, self._report)
+        found = rest_of(self._goal, scene, now, off, clearance, self._report)
         yield from self._ref.rest(THINKING if off < FALLBACK else SEARCHING)
         yield from self._follow(found, off)
 
@@ -556,6 +551,8 @@ class Executive:
             self._stop(why)
             return
         self._note(Replanned, changes=changes)
+        if self._plan.policy is None and found.fallback and found.fallback.source:
+            self._count_by(found)
         self._adopt(found, found.trajectory, FIRST)
         if changes == 0 and not self._at_hand.goes_on:
             # There is still the way to the last posture.
@@ -592,6 +589,15 @@ class Executive:
         self._at_hand = AtHand(plan, trajectory)
         self._bearing: list[Contact] = []  # contacts that are closed
         self._closed: tuple[int, bytes] | None = None  # when, and of which surfaces
+
+    def _count_by(self, plan: Plan) -> None:
+        """From here on steps are those of this plan: other contacts have their own."""
+        self._goal = plan
+        # A policy reads what comes next off the stance: it has no steps to count.
+        steps = () if plan.policy else split_steps(plan.sequence, plan.world)[0]
+        self.done = 0 if plan.state is None else plan.state.done
+        self._steps = len(steps)
+        self._begun = self.done + 1 - len(self._reached)
 
     def _note(self, kind: type[Event], **what: Any) -> None:
         self.events.append(kind(time=self.core.steps * PHYSICS_STEP, **what))

@@ -15,7 +15,7 @@ Shapes: K points.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import mujoco
@@ -387,45 +387,6 @@ def with_room(
     Returns:
         The shapes, names of links that are not kept apart, and of shapes made thinner.
     """
-    room = ROOM * _scale(tree, found)
-    near = list(_between_links(tree, found, shapes, home))
-    apart = {x.links: None for x in near if x.distance <= x.limit}
-    lack: dict[str, float] = {}
-    for x in near:
-        if x.links not in apart and x.distance < room:
-            for n in x.gives:
-                less = (room - x.distance) / len(x.gives)
-                lack[n] = max(lack.get(n, 0.0), less)
-    most, out = {s.name: _most(s) for s in shapes}, []
-    for s in shapes:
-        less, n = min(lack.get(s.name, 0.0), most[s.name]), _sizes(s)
-        size = tuple(x - less if k < n else x for k, x in enumerate(s.size))
-        out.append(replace(s, size=size))
-    # Beside what has become thinner some have room after all.
-    meet = {
-        x.links
-        for x in _between_links(tree, found, out, home)
-        if x.links in apart and x.distance <= max(x.limit, 0.0)
-    }
-    return out, [links for links in apart if links in meet], sorted(lack)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Between:
-    """Two shapes of links that may not overlap: how far apart, and who may give way.
-
-    Up to `limit` their links are not kept apart [m].
-    """
-
-    links: tuple[str, str]
-    distance: float
-    limit: float
-    gives: list[str]
-
-
-def _between_links(
-    tree: Tree, found: Anatomy, shapes: Sequence[Shape], home: Mapping[str, float]
-) -> Iterator[_Between]:
     scale = _scale(tree, found)
     room, touching = ROOM * scale, TOUCHING * scale
     spec, _ = build_spec("trial", tree, found, shapes, looks=False)
@@ -434,36 +395,39 @@ def _between_links(
     for name, angle in home.items():
         data.qpos[trial.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(trial, data)
-    parent, turns = trial.body_parentid, trial.body_jntnum
-    most = {s.name: _most(s) for s in shapes}
+    parent, turns, near = trial.body_parentid, trial.body_jntnum, []
+    most = {s.name: THINNER * min(s.size[: _sizes(s)]) for s in shapes}
     balls = {s.name for s in shapes if s.surface and s.kind == _SPHERE}
     links_only = {s.name for s in shapes if not s.surface}
     for a in range(trial.ngeom):
         for b in range(a + 1, trial.ngeom):
             i, j = sorted((int(trial.geom_bodyid[a]), int(trial.geom_bodyid[b])))
-            if i == j or (parent[j] == i and turns[j] <= 2):
-                continue
-            d = mujoco.mj_geomDistance(trial, data, a, b, 1.0, None)
-            beside = parent[i] == parent[j]
-            joints = turns[j] + turns[i if beside else int(parent[j])]
-            two = joints <= 2 and (beside or parent[parent[j]] == i)
-            names = trial.geom(a).name, trial.geom(b).name
-            gives = [n for n in names if n in links_only]
-            deepest = -room
-            if d <= 0.0 and balls.intersection(names):
-                gives, deepest = [n for n in names if n in links_only | balls], -1.0
-            won = sum(most[n] for n in gives)
-            yield _Between(
-                links=(trial.body(i).name, trial.body(j).name),
-                distance=d,
-                limit=touching if two else min(0.0, max(deepest, room - won)),
-                gives=gives,
-            )
-
-
-def _most(shape: Shape) -> float:
-    """By how much a shape may become thinner [m]."""
-    return THINNER * min(shape.size[: _sizes(shape)])
+            if i != j and (parent[j] != i or turns[j] > 2):
+                d = mujoco.mj_geomDistance(trial, data, a, b, 1.0, None)
+                beside = parent[i] == parent[j]
+                joints = turns[j] + turns[i if beside else int(parent[j])]
+                two = joints <= 2 and (beside or parent[parent[j]] == i)
+                links = trial.body(i).name, trial.body(j).name
+                names = trial.geom(a).name, trial.geom(b).name
+                gives = [n for n in names if n in links_only]
+                deepest = -room
+                if d <= 0.0 and balls.intersection(names):
+                    gives, deepest = [n for n in names if n in links_only | balls], -1.0
+                won = sum(most[n] for n in gives)
+                limit = touching if two else min(0.0, max(deepest, room - won))
+                near.append((d, limit, links, gives))
+    apart = {links: None for d, limit, links, _ in near if d <= limit}
+    lack: dict[str, float] = {}
+    for d, _, links, gives in near:
+        if links not in apart and d < room:
+            for n in gives:
+                lack[n] = max(lack.get(n, 0.0), (room - d) / len(gives))
+    out = []
+    for s in shapes:
+        less, n = min(lack.get(s.name, 0.0), most[s.name]), _sizes(s)
+        size = tuple(x - less if k < n else x for k, x in enumerate(s.size))
+        out.append(replace(s, size=size))
+    return out, list(apart), sorted(lack)
 
 
 def _sizes(shape: Shape) -> int:
