@@ -146,6 +146,7 @@ def gains_of(
     for j in found.moving:
         name, d = tree.name(j), int(model.jnt_dofadr[j])
         armature, damping = float(model.dof_armature[d]), float(model.dof_damping[d])
+        described = min(armature, MAX_ARMATURE)
         light_armature = light_damping = 1.0
         if effort[name] < WEAK * mass * 9.81 * height:
             gains[name] = rounded(kp=WEAK_KP * kp, kd=WEAK_KD * kd, ki=WEAK_KD * ki)
@@ -155,11 +156,11 @@ def gains_of(
         if damping <= 0:
             damping = _two_digits(DAMPING * inertia * light_damping)
         drives[j] = (min(armature, MAX_ARMATURE), min(damping, MAX_DAMPING))
-        heavy = (drives[j][0] + links) / (ARMATURE + LINKS)
+        heavy = (described + links) / (ARMATURE + LINKS)
         if heavy > stiff and name not in gains:
-            p, d = heavy / stiff, heavy / np.sqrt(stiff * inertia)
-            quick[name] = (p * kp, d * kd)
-            gains[name] = rounded(kp=p * kp, kd=d * kd, ki=p * ki)
+            more, damped = heavy / stiff, heavy / np.sqrt(stiff * inertia)
+            quick[name] = (more * kp, damped * kd)
+            gains[name] = rounded(kp=more * kp, kd=damped * kd, ki=more * ki)
     soft = [c.elbow for c in found.limbs.values()]
     soft += [j for j in found.trunk if abs(float(data.xaxis[j, 1])) < 0.7]
     impedance = {
