@@ -225,6 +225,13 @@ def test_an_sdf_that_includes_others_or_places_things_by_name_says_so(tmp_path):
 # OBJ as exporters write them.
 
 
+def test_an_obj_of_edges_alone_is_refused_in_a_sentence(tmp_path):
+    corners = "\n".join(f"v {k & 1} {k >> 1 & 1} {k >> 2}" for k in range(9))
+    (tmp_path / "b.obj").write_text(f"o rock\n{corners}\nf 1 2\n")
+    with pytest.raises(InputError, match=r"b\.obj.*expected"):
+        load_scene(tmp_path / "b.obj")
+
+
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("faces", [False, True])
 def test_a_box_whose_faces_have_corners_of_their_own_is_one_box(tmp_path, split, faces):

@@ -49,7 +49,7 @@ from clamber.model.scene import GROUND
 from clamber.model.se3 import quat_from_yaw, quat_multiply
 from clamber.model.world import PHYSICS_STEP
 from clamber.planning.planner import timed
-from clamber.planning.records import PlanOptions, numbered
+from clamber.planning.records import Fallback, PlanOptions, State, numbered
 from clamber.planning.trajectory import HOLD_END, HOLD_START
 from clamber.step.change import Failure
 from test_gait import POLICY
@@ -565,6 +565,49 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
         told.finish()
         assert kinds(told.events[1:]) == said
         assert told.executive.stopped == "no way"
+
+
+def test_with_other_contacts_what_is_done_is_counted_by_their_steps(
+    hands_plan, monkeypatch
+):
+    """A search numbers its steps anew: those of the first plan say nothing then."""
+    state = State(stance=(), loaded=(), q=hands_plan.world.home, done=0)
+    other = replace(
+        hands_plan,
+        start=hands_plan.keyframes[1],
+        sequence=replace(hands_plan.sequence, source="others"),
+        changes=numbered(hands_plan.changes[1:], 1),
+        trajectory=timed(hands_plan.world, hands_plan.changes[1:], "max"),
+        fallback=Fallback(reason="", source="search"),
+    )
+    asked = []
+
+    def found(goal, *_, start, **__):
+        asked.append((goal, start.done))
+        done = 4  # the search takes more steps to where the robot stands
+        return replace(
+            other,
+            changes=numbered(hands_plan.changes[1:], done),
+            state=replace(state, done=done),
+        )
+
+    monkeypatch.setattr(executive, "plan", found)
+    told, touch = Told(hands_plan), touch_of(hands_plan, 0)
+    told.to(touch - 100)
+    told.up = 1.1 * FALLBACK
+    told.to(touch, LHand=50.0)
+    told.until(2)
+    assert kinds(told.events) == [ContactMoved, Replanned]
+    told.trajectory, told.k, told.moves = other.trajectory, 299, True
+    told.up = 0.0
+    there = other.trajectory.segments[1].end
+    told.to(there - 100)
+    told.up = 1.1 * FALLBACK
+    told.to(there, RHand=50.0)
+    told.until(4)
+    (first, begun), (second, done) = asked
+    assert (first.source, begun) == (hands_plan.sequence.source, 1)
+    assert (second.source, done) == ("others", 5)
 
 
 @pytest.mark.parametrize(

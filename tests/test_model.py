@@ -724,16 +724,22 @@ def test_a_ball_rolls_by_radius_times_angle_and_the_way_it_turns(
     )
 
 
-def test_rolling_is_what_a_ball_does_without_slipping(world):
-    """Integrated from velocities: the material point at the contact is at rest."""
+@pytest.mark.parametrize("spin", [0.0, 0.7, -2.0])
+def test_rolling_is_what_a_ball_does_without_slipping(world, spin):
+    """Integrated from velocities: the material point at the contact is at rest.
+
+    Args:
+        world: Of the ball.
+        spin: Turn about the normal, of that which rolls.
+    """
     kin = Kinematics(world)
     kin.update(world.home)
     s = world.surfaces["LKnee"]
     link = kin.rotation(s.body).copy()
     normal = matrix_from_rpy([0.2, -0.3, 0.0])[:, 2]
     axis = np.array([0.3, 0.8, 0.1])
-    axis -= normal * (axis @ normal)  # a turn about the normal rolls nowhere
-    axis /= np.linalg.norm(axis)
+    axis -= normal * (axis @ normal)
+    axis = axis / np.linalg.norm(axis) + spin * normal
     theta, n = 0.9, 2000
     centre, R = np.zeros(3), np.eye(3)
     for _ in range(n):
@@ -748,6 +754,25 @@ def test_rolling_is_what_a_ball_does_without_slipping(world):
     moved = kin.roll("LKnee", normal, quat_from_matrix(link))
     np.testing.assert_allclose(moved, centre, atol=1e-9)
     assert moved @ normal == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("spin_first", [False, True])
+def test_of_turns_one_after_another_a_roll_is_off_by_half_their_product(
+    world, spin_first
+):
+    """The true way is radius times roll, towards where the axis was: [limitations]."""
+    kin = Kinematics(world)
+    s, roll, spin = world.surfaces["LKnee"], 0.5, 0.3
+    turns = Rotation.from_rotvec([0, roll, 0]), Rotation.from_rotvec([0, 0, spin])
+    R = turns[0] * turns[1] if spin_first else turns[1] * turns[0]
+    kin.update(world.home)
+    link = quat_from_matrix(kin.rotation(s.body))
+    q = world.home.copy()
+    q[3:7] = quat_from_matrix(R.as_matrix() @ matrix_from_quat(world.home[3:7]))
+    kin.update(q)
+    true = s.radius * np.array([roll, 0.0, 0.0])  # the axis of the roll is y, also last
+    off = np.linalg.norm(kin.roll("LKnee", UP, link) - true)
+    assert off == pytest.approx(s.radius * roll * spin / 2, rel=0.02)
 
 
 def test_turning_on_the_spot_rolls_nowhere_and_flat_surfaces_never_roll(kin):
