@@ -130,6 +130,18 @@ def test_what_an_mjcf_includes_is_found_beside_it(tmp_path, monkeypatch):
         read_description(path)
 
 
+@pytest.mark.parametrize("kind", ["mjcf", "urdf"])
+def test_a_value_that_is_no_number_is_refused_by_its_field(tmp_path, capfd, kind):
+    text = humanoids.mjcf() if kind == "mjcf" else humanoids.urdf()
+    at = text.index('axis="') if kind == "mjcf" else text.index('xyz="')
+    first = text.index('"', at) + 1
+    path = tmp_path / ("r.xml" if kind == "mjcf" else "r.urdf")
+    path.write_text(f"{text[:first]}NaN {text[text.index(' ', first) + 1 :]}")
+    with pytest.raises(InputError, match=rf"{path.name}: \w+ (axis|xyz).*NaN.*numbers"):
+        read_description(path)
+    assert capfd.readouterr().err == ""
+
+
 def test_what_comes_again_does_not_matter(tmp_path, capfd):
     (tmp_path / "t.stl").write_bytes(stl(CUBE))
     text = humanoids.urdf(mesh="t.stl")

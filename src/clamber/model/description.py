@@ -95,9 +95,11 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
             _check_inertia(root, path, lenient, notes)
             _without_repeats(root)
             _keep_all(root)
+            _check_numbers(root, path)
             text = ElementTree.tostring(root, encoding="unicode")
             spec = mujoco.MjSpec.from_string(text)
         elif root.tag in ("mujoco", "mujocoinclude"):
+            _check_numbers(root, path)
             spec = mujoco.MjSpec.from_file(str(path))
             mimics = {
                 str(e.name1): str(e.name2)
@@ -114,6 +116,18 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
     except ValueError as e:
         raise InputError(f"a model that MuJoCo loads ({_one_line(e)})", path) from e
     return Description(spec=spec, mimics=mimics, notes=tuple(notes))
+
+
+def _check_numbers(root: ElementTree.Element, path: Path) -> None:
+    """Refuse NaN, of which MuJoCo prints a warning of its own.
+
+    Raises:
+        InputError: There is one.
+    """
+    for e in root.iter():
+        for name, value in e.attrib.items():
+            if name != "name" and "nan" in value.lower().split():
+                raise InputError("numbers", path, f"{e.tag} {name}", value)
 
 
 def compile_description(description: Description, path: Path) -> mujoco.MjModel:

@@ -145,7 +145,7 @@ class World:
 
     @property
     def force_scale(self) -> float:
-        """Of forces that are told from none: 1, less for robots below `FULL_MASS`."""
+        """Of the least forces that count as contacts: 1, less below `FULL_MASS`."""
         return min(1.0, self.mass / FULL_MASS)
 
     def landmark(self, name: str) -> tuple[int, np.ndarray]:
