@@ -591,7 +591,7 @@ def test_with_other_contacts_what_is_done_is_counted_by_their_steps(
             state=replace(state, done=done),
         )
 
-    monkeypatch.setattr(executive, "plan", found)
+    monkeypatch.setattr(progress, "plan", found)
     told, touch = Told(hands_plan), touch_of(hands_plan, 0)
     told.to(touch - 100)
     told.up = 1.1 * FALLBACK

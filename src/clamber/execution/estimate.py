@@ -143,7 +143,7 @@ class Estimate:
         if self.force(c) < self.touch:
             return False
         p, support = self.point(c), self.world.supports[c.support]
-        return bool(support.inside(p)) and abs(support.height(p)) < REACH
+        return bool(support.inside(p) and abs(support.height(p)) < REACH)
 
     def is_lost(self, c: Contact) -> bool:
         """Neither the contact's surface nor another one of the limb is loaded."""
