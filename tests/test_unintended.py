@@ -9,11 +9,15 @@ from clamber.execution.disturbance import Disturbance
 from clamber.execution.events import Unintended
 from clamber.execution.simulation import simulate
 from clamber.execution.unintended import (
+    ALERT,
     AWAY,
+    KNOWN,
+    LASTS,
     MISSING,
     SEARCHED,
     SIDEWAYS,
     UP,
+    Watch,
     hit_sideways,
     load_is_missing,
     loaded_link,
@@ -155,6 +159,34 @@ def test_a_surface_is_never_what_leans(kin, demo_plan, weight):
         load = loads(kin, stance, weight, 0.2 * weight * UP, p)
         found = loaded_link(kin, load, weight)
         assert found is None or found.geom not in own
+
+
+@pytest.mark.parametrize(("alert", "lasts"), [(False, LASTS), (True, ALERT)])
+def test_it_is_asked_about_sooner_where_supports_are_uneven(alert, lasts):
+    watch, period = Watch(("LHand",), 0.01), 0.01
+    watch.weight, watch.alert = 250.0, alert
+    n = round(lasts / period)
+    for share in (1.0 - 1.1 * MISSING, 1.0, 1.0 - 1.1 * MISSING):
+        load = np.array([[0.0, 0.0, share * 250.0]])
+        for k in range(n - 1):
+            watch.look(load, set)
+            assert watch.seems_so == (share < 1.0)
+            assert not watch.is_due, k
+    for _ in range(2):
+        watch.look(load, set)
+    assert watch.is_due
+
+
+def test_the_ground_is_known(demo_plan):
+    """An ankle over it is not on it; over a box it may be higher than believed."""
+    kin = Kinematics(demo_plan.world)
+    for up, near in ((KNOWN + 0.005, False), (KNOWN - 0.005, True)):
+        q = demo_plan.world.home.copy()
+        kin.update(q)
+        q[2] -= min(kin.contact_point(s, UP)[2] for s in ("LFoot", "RFoot")) - up
+        kin.update(q)
+        found = nearest_of(kin, ["LFoot", "RFoot"])
+        assert (found is not None) == near
 
 
 @pytest.mark.parametrize(("share", "leans"), [(0.9, False), (1.1, True)])
