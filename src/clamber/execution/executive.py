@@ -10,10 +10,11 @@ of a change is re-established by probing. Where nothing is found, the others car
 robot and another place is planned for the limb; where there is none, it stays in the
 stance it is in and says why.
 
-Beside the plan there are four reactions, the most urgent first: to an unintended
-contact (`_retreat`), to one that is elsewhere (`_take`, `_accept`), to one that is
-missing (`_seek`) and to one that is lost (`_recover`). What is known is an `Estimate`,
-what the joints are to do a `Reference`; between them this module decides.
+Beside the plan there are five reactions, the most urgent first: to an unintended
+contact (`_retreat`), to a limb that has slipped back to another support
+(`_go_on_from_here`), to a contact that is elsewhere (`_take`, `_accept`), to one that
+is missing (`_seek`) and to one that is lost (`_recover`). What is known is an
+`Estimate`, what the joints are to do a `Reference`; between them this module decides.
 """
 
 from __future__ import annotations
