@@ -50,19 +50,11 @@ class Balance:
             kin.data.xpos,
             kin.data.xmat,
             kin.com,
-            **{
-                "high": HIGH * world.length_scale,
-                "fade": FADE * world.length_scale,
-                "sag": SAG,
-                "p": P,
-                "d": D,
-                "t": T,
-            },
-            **{
-                "most": MOST * world.length_scale,
-                "smoothing": RATE_SMOOTHING,
-                "settled": SETTLED,
-            },
+            high=HIGH * world.length_scale,
+            fade=FADE * world.length_scale,
+            most=MOST * world.length_scale,
+            **{"sag": SAG, "p": P, "d": D, "t": T},
+            **{"smoothing": RATE_SMOOTHING, "settled": SETTLED},
             period=period,
         )
         self._contacts: Sequence[Contact] = ()

@@ -141,8 +141,7 @@ class Executive:
         """What to follow next; `look` once every `LOOK_STRIDE` steps."""
         if look:
             self.watch.look(self.estimate.load, self._in_use)
-            actual = ((c, self._actual(c)) for c in self._bearing)
-            back = any(c.support != x.support for c, x in actual)
+            back = self._has_slipped(self._bearing)
             self._back = self._back + LOOK_STRIDE * PHYSICS_STEP if back else 0.0
             if (
                 self._pause is not None
@@ -226,11 +225,7 @@ class Executive:
             return
         yield from self._ref.play(span.end, until=self._is_wrong)
         self._count_change()
-        if self.watch.found is not None:
-            yield from self._retreat(span.touch, span.makes)
-            return
-        if self._is_back():
-            yield from self._go_on_from_here()
+        if (yield from self._set_right(span.touch, span.makes)):
             return
         estimate = self.estimate
         loaded = [c for c in self.stance if estimate.force(c) >= estimate.lost]
@@ -262,11 +257,7 @@ class Executive:
                 span.touch, until=lambda: touches(c) or self._is_wrong()
             )
             self.estimate.expect()
-        if self.watch.found is not None:
-            yield from self._retreat(span.begin)
-            return True
-        if self._is_back():
-            yield from self._go_on_from_here()
+        if (yield from self._set_right(span.begin)):
             return True
         if ref.i < span.touch and self.estimate.deviation(c)[0] > DEVIATION:
             yield from self._take(c, c)
@@ -286,11 +277,9 @@ class Executive:
             return False
         yield from ref.back(span.touch)  # where the others hold the robot
         found = yield from self._probe(c)
-        if self.watch.found is not None:
-            yield from self._retreat(span.begin)
-        elif self._is_back():
-            yield from self._go_on_from_here()
-        elif found is None:
+        if (yield from self._set_right(span.begin)):
+            return True
+        if found is None:
             yield from self._seek(c)
         elif found is not c or abs(self.estimate.deviation(c)[0]) > DEVIATION:
             yield from self._take(found, c)
@@ -356,7 +345,7 @@ class Executive:
         yield from self._ref.hold(LOOK)
         if (yield from self._retreat_from_here()):
             return True
-        if any(self._actual(c).support != c.support for c in self.stance):
+        if self._has_slipped(self.stance):
             yield from self._go_on_from_here()
             return True
         return False
@@ -372,6 +361,10 @@ class Executive:
     def _actual(self, c: Contact) -> Contact:
         """The contact, or that of another surface of the limb in its place."""
         return self.estimate.substitute(c) or c
+
+    def _has_slipped(self, stance: Iterable[Contact]) -> bool:
+        """Is a limb back on another support?"""
+        return any(self._actual(c).support != c.support for c in stance)
 
     def _is_elsewhere(self, c: Contact) -> bool:
         actual = self._actual(c)
@@ -395,6 +388,16 @@ class Executive:
         if not self._is_unintended():
             return False
         yield from self._retreat(self._ref.i)
+        return True
+
+    def _set_right(self, to: int, makes: Contact | None = None) -> Reaction:
+        """Has something gone wrong on the way? Back `to` a sample, or on from here."""
+        if self.watch.found is not None:
+            yield from self._retreat(to, makes)
+        elif self._is_back():
+            yield from self._go_on_from_here()
+        else:
+            return False
         return True
 
     def _retreat(self, to: int, makes: Contact | None = None) -> Actions:

@@ -111,10 +111,14 @@ def body_meshes(
     return meshes
 
 
+def own_geoms(model: mujoco.MjModel, world: World) -> np.ndarray:
+    """(ngeom,) bool: geoms of the robot, in the model of a world or one dressed up."""
+    return model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+
+
 def own_meshes(world: World) -> np.ndarray:
     """(ngeom,) bool: the meshes that the robot of a world is drawn with."""
-    model = world.model
-    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
+    model, own = world.model, own_geoms(world.model, world)
     meshes = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
     return own & meshes & np.isin(model.geom_group, SHOWN_GROUPS)
 

@@ -28,7 +28,13 @@ from clamber.model.scene import GROUND
 from clamber.model.se3 import matrix_from_quat
 from clamber.model.world import World
 from clamber.show.framing import View
-from clamber.show.meshes import PAD_COLOUR, geom_colour, own_meshes, pads_of
+from clamber.show.meshes import (
+    PAD_COLOUR,
+    geom_colour,
+    own_geoms,
+    own_meshes,
+    pads_of,
+)
 
 STEEP = 70.0  # [deg] elevation from which a camera has no ahead of its own
 Colour = tuple[float, float, float, float]  # in [0, 1]
@@ -583,11 +589,6 @@ class _Cap:
         return bar(mujoco.mjtGeom.mjGEOM_CYLINDER, ends, self.radius, self.colour)
 
 
-def _own(model: mujoco.MjModel, world: World) -> np.ndarray:
-    """(ngeom,) bool: the robot's."""
-    return model.body_rootid[model.geom_bodyid] == model.body_rootid[world.base]
-
-
 def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
     """Axles of the hinges that lie in a ball or a capsule of their link.
 
@@ -596,7 +597,7 @@ def _joint_caps(model: mujoco.MjModel, world: World) -> list[_Cap]:
     if own_meshes(world).any():
         return []
     round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
-    round_ones = _own(model, world) & np.isin(
+    round_ones = own_geoms(model, world) & np.isin(
         model.geom_type, [k.value for k in round_ones]
     )
     caps = []
