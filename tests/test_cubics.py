@@ -8,6 +8,7 @@ import pytest
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.ndimage import correlate1d
 
+from clamber import _core
 from clamber.model import cubics
 from clamber.recording.detect import correlated, local_quadratics
 
@@ -22,7 +23,7 @@ def some(n, seed=0):
 def test_a_smooth_curve_and_its_derivatives_are_those_of_a_clamped_spline(n):
     x, y = some(n)
     ends = np.random.default_rng(n).normal(size=(2, 7))
-    c = cubics.pieces(x, y, cubics.smooth_slopes(x, y, ends))
+    c = cubics.pieces(x, y, _core.smooth_slopes(x, y, ends))
     known = CubicSpline(x, y, bc_type=((1, ends[0]), (1, ends[1])))
     assert np.array_equal(c, known.c)
     at = np.concatenate([x, np.linspace(x[0] - 0.1, x[-1] + 0.1, 101)])
@@ -38,7 +39,7 @@ def test_nodes_increase_and_points_are_finite():
         *((x * nothing, y), (x, y * nothing[:, None])),
     ):
         with pytest.raises(ValueError, match="nodes that increase"):
-            cubics.smooth_slopes(nodes, points, ends)
+            _core.smooth_slopes(nodes, points, ends)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 30])

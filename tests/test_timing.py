@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from clamber.model.kinematics import Kinematics
 from clamber.planning.timing import (
     FASTEST,
     SMOOTHING,
@@ -36,7 +37,7 @@ def knee_phases(demo_plan):
 
 @pytest.fixture(scope="module")
 def fast(demo_plan, knee_phases):
-    return build_trajectory(demo_plan.world, knee_phases, speed="max")
+    return build_trajectory(Kinematics(demo_plan.world), knee_phases, speed="max")
 
 
 def law(kin, key, s, u_max, x_max, inertia=None, share=1.0) -> np.ndarray:
@@ -224,12 +225,12 @@ def test_a_contact_is_made_gently(demo_plan, demo_kinematics, knee_phases, fast)
 def test_it_is_faster_than_any_limit_and_the_same_every_time(
     demo_plan, demo_kinematics, knee_phases, fast
 ):
-    again = build_trajectory(demo_plan.world, knee_phases, speed="max")
+    again = build_trajectory(Kinematics(demo_plan.world), knee_phases, speed="max")
     assert np.array_equal(fast.q, again.q)
     assert np.array_equal(fast.tau, again.tau)
     last = fast.time[-1] - HOLD_START - HOLD_END
     for speed in (2.0, 1.0, 0.3):
-        slow = build_trajectory(demo_plan.world, knee_phases, speed=speed)
+        slow = build_trajectory(Kinematics(demo_plan.world), knee_phases, speed=speed)
         assert slow.time[-1] - HOLD_START - HOLD_END > 1.02 * last
         last = slow.time[-1] - HOLD_START - HOLD_END
     for k in range(1, len(fast.time) - 1, 7):
@@ -245,7 +246,7 @@ def test_the_robot_moves_on_while_contacts_change(demo_plan):
     a, b = (round((x + 0.1) * RATE) for x in (HOLD_START, t.time[-1] - HOLD_END - 0.2))
     assert speed[a:b].min() > 0.005
     apart = (
-        build_trajectory(demo_plan.world, change.phases, speed="max")
+        build_trajectory(Kinematics(demo_plan.world), change.phases, speed="max")
         for change in demo_plan.changes
     )
     moving = sum(x.time[-1] - HOLD_START - HOLD_END for x in apart)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
+from clamber.model.kinematics import Kinematics
 from clamber.planning.timing import BASE_LENGTH
 from clamber.planning.trajectory import (
     HOLD_END,
@@ -103,7 +104,7 @@ def test_velocity_integrates_to_the_last_posture(demo_plan, demo_kinematics):
 def test_no_joint_is_faster_than_the_limit_and_the_fastest_reaches_it(
     demo_plan, knee_phases, speed
 ):
-    trajectory = build_trajectory(demo_plan.world, knee_phases, speed=speed)
+    trajectory = build_trajectory(Kinematics(demo_plan.world), knee_phases, speed=speed)
     fastest = np.abs(trajectory.v[:, 6:]).max()
     assert fastest <= speed * 1.03  # between two looks at it
     if speed < 0.5:  # at 1 rad/s the phases are too short to cruise
@@ -162,7 +163,7 @@ def test_the_other_sign_of_a_posture_s_quaternion_changes_nothing(
     flipped = shift.q.copy()
     flipped[1::2, 3:7] *= -1
     a, b = (
-        build_trajectory(demo_plan.world, (replace(shift, q=q),), speed=0.3)
+        build_trajectory(Kinematics(demo_plan.world), (replace(shift, q=q),), speed=0.3)
         for q in (shift.q, flipped)
     )
     assert np.allclose(a.q, b.q, atol=1e-12)
@@ -173,7 +174,7 @@ def test_it_passes_through_every_posture_of_every_path_in_order(
     demo_plan, demo_kinematics
 ):
     phases = [p for change in demo_plan.changes for p in change.phases]
-    trajectory, k = build_trajectory(demo_plan.world, phases, speed=0.3), 0
+    trajectory, k = build_trajectory(Kinematics(demo_plan.world), phases, speed=0.3), 0
     for phase in phases:
         for node in phase.q:
             window = trajectory.q[k : k + 8000]
@@ -231,7 +232,7 @@ def test_at_is_clipped_to_the_ends(demo_plan):
 
 
 def test_the_moving_surface_is_open_while_it_swings(demo_plan, knee_phases):
-    trajectory = build_trajectory(demo_plan.world, knee_phases, speed=0.3)
+    trajectory = build_trajectory(Kinematics(demo_plan.world), knee_phases, speed=0.3)
     foot, knee = (trajectory.surfaces.index(n) for n in ("LFoot", "LKnee"))
     changes = np.flatnonzero(np.diff(trajectory.contact, axis=0).any(axis=1))
     lift, land = changes
@@ -340,7 +341,7 @@ def test_feed_forward_torques_are_continuous_and_within_effort_limits(demo_plan)
 def test_phases_that_do_not_join_are_refused(demo_plan, knee_phases):
     shift, _, settle = knee_phases
     with pytest.raises(ValueError, match="does not begin where the last one ended"):
-        build_trajectory(demo_plan.world, (shift, settle), speed=0.3)
+        build_trajectory(Kinematics(demo_plan.world), (shift, settle), speed=0.3)
 
 
 def test_arrays_of_different_length_are_refused(demo_plan):

@@ -7,6 +7,10 @@
 #include <algorithm>
 #include <cstddef>
 #include <initializer_list>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
 
 namespace clamber {
 
@@ -31,12 +35,34 @@ nb::ndarray<nb::numpy, T> new_array(const T* data, std::initializer_list<std::si
     return {copy, shape, owner};
 }
 
+using Matrix = nb::ndarray<nb::numpy, double, nb::c_contig, nb::device::cpu>;
+
+inline Matrix own(std::vector<double>&& data, std::vector<std::size_t> shape) {
+    auto* kept = new std::vector<double>(std::move(data));
+    nb::capsule owner(kept, [](void* p) noexcept {
+        delete static_cast<std::vector<double>*>(p);
+    });
+    return Matrix(kept->data(), shape.size(), shape.data(), owner);
+}
+
+inline Matrix own(std::vector<double>&& data) {
+    const std::size_t n = data.size();
+    return own(std::move(data), {n});
+}
+
+inline void check_size(std::size_t n, std::size_t expected, const char* what) {
+    if (n != expected)
+        throw std::invalid_argument(std::string(what) + ": " + std::to_string(n) +
+                                    " numbers, expected " + std::to_string(expected));
+}
+
 void bind_polygon(nb::module_& m);
 void bind_statics(nb::module_& m);
 void bind_geometry(nb::module_& m);
 void bind_planes(nb::module_& m);
 void bind_model(nb::module_& m);
 void bind_posture(nb::module_& m);
+void bind_spline(nb::module_& m);
 void bind_servo(nb::module_& m);
 
 }  // namespace clamber

@@ -190,46 +190,6 @@ void difference(const Model& model, const double* a, const double* b, double* ou
     }
 }
 
-void on_manifold(const double* slope, std::size_t n, double* q, double* v) {
-    const double *a = q + 3, *b = slope + 3;
-    const double size = std::sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3]);
-    double unit[4], rate[4], along = 0.0;
-    for (int k = 0; k < 4; ++k) unit[k] = a[k] / size;
-    for (int k = 0; k < 4; ++k) along += unit[k] * b[k];
-    for (int k = 0; k < 4; ++k) rate[k] = (b[k] - unit[k] * along) / size;
-    const Quat turn = conjugate(readq(unit)) * readq(rate);
-    std::copy(unit, unit + 4, q + 3);
-    std::copy(slope, slope + 3, v);
-    v[3] = 2.0 * turn.x, v[4] = 2.0 * turn.y, v[5] = 2.0 * turn.z;
-    std::copy(slope + 7, slope + n, v + 6);
-}
-
-void along_spline(const double* c, const double* nodes, std::size_t n, std::size_t width,
-                  double s, double* out, double* slope) {
-    const double* const after = std::upper_bound(nodes + 1, nodes + n - 1, s);
-    const std::size_t i = std::size_t(after - nodes) - 1, degree = (n - 1) * width;
-    const double x = s - nodes[i], xx = x * x;
-    c += i * width;
-    for (std::size_t j = 0; j < width; ++j) {
-        const double c0 = c[j + 3 * degree], c1 = c[j + 2 * degree], c2 = c[j + degree];
-        out[j] = c0 + c1 * x + c2 * xx + c[j] * (xx * x);
-        slope[j] = c1 + c2 * x * 2.0 + c[j] * xx * 3.0;
-    }
-}
-
-void between_rows(const double* rows, const double* nodes, std::size_t n, std::size_t width,
-                  double s, double* out) {
-    const std::size_t next = std::size_t(std::upper_bound(nodes, nodes + n, s) - nodes);
-    const double* const b = rows + std::min(next, n - 1) * width;
-    if (next == 0 || next == n) {
-        std::copy(b, b + width, out);
-        return;
-    }
-    const double *a = b - width, span = nodes[next] - nodes[next - 1];
-    for (std::size_t j = 0; j < width; ++j)
-        out[j] = (b[j] - a[j]) / span * (s - nodes[next - 1]) + a[j];
-}
-
 Quat quat_from_matrix(const Mat3& R) {
     const double trace = R(0, 0) + R(1, 1) + R(2, 2);
     Quat q;

@@ -130,16 +130,6 @@ class Kinematics {
 // (nq) q moved along the tangent vector v for unit time, and the vector from a to b.
 void integrate(const Model&, const double* q, const double* v, double* out);
 void difference(const Model&, const double* a, const double* b, double* out);
-// Raw coordinates (n) of a free joint and hinges, brought onto the manifold in place, and
-// the tangent vector (n - 1) that goes with their slope.
-void on_manifold(const double* slope, std::size_t n, double* q, double* v);
-// Of the n nodes' cubic pieces, coefficients (4, n - 1, width) from the third power down:
-// value and slope (width) at s. The end pieces go on beyond the nodes.
-void along_spline(const double* c, const double* nodes, std::size_t n, std::size_t width,
-                  double s, double* out, double* slope);
-// Linear between rows (n, width); the first and the last beyond the nodes.
-void between_rows(const double* rows, const double* nodes, std::size_t n, std::size_t width,
-                  double s, double* out);
 Quat quat_from_matrix(const Mat3& R);
 // z along the normal, x along the heading as far as it can.
 Mat3 frame_from_normal(const Vec3& normal, const Vec3& heading);

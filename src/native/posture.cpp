@@ -17,32 +17,11 @@ namespace {
 
 // Rows of contacts: whole numbers, and real ones.
 using Packed = std::tuple<Array2<int>, Array2<>>;
-using Matrix = nb::ndarray<nb::numpy, double, nb::c_contig, nb::device::cpu>;
-
-Matrix own(std::vector<double>&& data, std::vector<std::size_t> shape) {
-    auto* kept = new std::vector<double>(std::move(data));
-    nb::capsule owner(kept, [](void* p) noexcept {
-        delete static_cast<std::vector<double>*>(p);
-    });
-    return Matrix(kept->data(), shape.size(), shape.data(), owner);
-}
-
-Matrix own(std::vector<double>&& data) {
-    const std::size_t n = data.size();
-    return own(std::move(data), {n});
-}
-
 Matrix stacked(const Postures& q, std::size_t nq) {
     std::vector<double> out;
     out.reserve(q.size() * nq);
     for (const auto& x : q) out.insert(out.end(), x.begin(), x.end());
     return own(std::move(out), {q.size(), nq});
-}
-
-void check_size(std::size_t n, std::size_t expected, const char* what) {
-    if (n != expected)
-        throw std::invalid_argument(std::string(what) + ": " + std::to_string(n) +
-                                    " numbers, expected " + std::to_string(expected));
 }
 
 int index(int i, std::size_t n, const char* what) {
@@ -203,33 +182,6 @@ void bind_posture(nb::module_& m) {
     m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);
     m.attr("PATH_OVERLAPS") = static_cast<int>(Path::Status::Overlaps);
     m.attr("PATH_WEAK") = static_cast<int>(Path::Status::Weak);
-    m.def("along_spline",
-          [](const Array3<>& c, const Array1<>& nodes, const Array1<>& s) {
-              const std::size_t n = s.size(), nq = c.shape(2);
-              if (nq < 7) throw std::invalid_argument("q begins with a free joint");
-              if (nodes.size() < 2 || c.shape(0) != 4 || c.shape(1) + 1 != nodes.size())
-                  throw std::invalid_argument("four coefficients between two nodes each");
-              std::vector<double> q(n * nq), v(n * (nq - 1)), slope(nq);
-              for (std::size_t i = 0; i < n; ++i) {
-                  double* const at = q.data() + i * nq;
-                  along_spline(c.data(), nodes.data(), nodes.size(), nq, s(i), at, slope.data());
-                  on_manifold(slope.data(), nq, at, v.data() + i * (nq - 1));
-              }
-              return nb::make_tuple(own(std::move(q), {n, nq}), own(std::move(v), {n, nq - 1}));
-          },
-          "Postures (n, nq) and tangent vectors (n, nv) along a cubic spline at s (n,).");
-    m.def("between_rows",
-          [](const Array2<>& rows, const Array1<>& nodes, const Array1<>& s) {
-              const std::size_t n = s.size(), width = rows.shape(1);
-              check_size(rows.shape(0), nodes.size(), "a row for each node");
-              if (nodes.size() < 1) throw std::invalid_argument("a node");
-              std::vector<double> out(n * width);
-              for (std::size_t i = 0; i < n; ++i)
-                  between_rows(rows.data(), nodes.data(), nodes.size(), width, s(i),
-                               out.data() + i * width);
-              return own(std::move(out), {n, width});
-          },
-          "Rows (n, k) at s (n,), linear between those of the nodes.");
     m.def("lean_direction",
           [](const Array1<>& p1, const Array1<>& p2, const Array2<>& R_WB) {
               check_size(p1.size() + p2.size() + R_WB.size(), 15, "points and rotation");
@@ -496,6 +448,43 @@ void bind_posture(nb::module_& m) {
              },
              "(n, na) torques that hold postures (n, nq), contacts at prices (n, k) or 0; "
              "against generalised forces (n, nv) of inertia, or (0, 0).")
+        .def("tangents",
+             [](Workspace& w, const Array2<>& q, double ha, double hb, double steeper,
+                const Array2<int>& what, const Array2<>& where) {
+                 const auto closed = read_contacts(*w.model, what, where);
+                 const std::size_t nq = w.model->nq, nv = w.model->nv;
+                 check_size(q.shape(0), 4, "postures");
+                 check_size(q.shape(1), nq, "q");
+                 const std::lock_guard lock(w.busy);
+                 std::vector<double> a(nv), v(nv);
+                 difference(*w.model, q.data(), q.data() + nq, a.data());
+                 difference(*w.model, q.data() + 2 * nq, q.data() + 3 * nq, v.data());
+                 for (std::size_t d = 0; d < nv; ++d) {
+                     const double before = a[d] / ha, after = v[d] / hb;
+                     const double mean = (hb * before + ha * after) / (ha + hb);
+                     const double slower = std::min(std::abs(before), std::abs(after));
+                     const double most = before * after > 0.0 ? steeper * slower : 0.0;
+                     v[d] = std::min(std::max(mean, -most), most);
+                 }
+                 Kinematics& kin = w.planner.solver.kin;
+                 kin.update(q.data() + 2 * nq);
+                 keep_closed(kin, closed, v.data());
+                 // Of raw coordinates, whose quaternions may have another sign on each side.
+                 std::vector<double> out(2 * nq);
+                 for (std::size_t side = 0; side < 2; ++side) {
+                     const double* const quat = q.data() + (1 + side) * nq + 3;
+                     double* const raw = out.data() + side * nq;
+                     const Quat turn = readq(quat) * Quat{0.0, v[3], v[4], v[5]};
+                     std::copy_n(v.data(), 3, raw);
+                     raw[3] = 0.5 * turn.w, raw[4] = 0.5 * turn.x;
+                     raw[5] = 0.5 * turn.y, raw[6] = 0.5 * turn.z;
+                     std::copy(v.begin() + 6, v.end(), raw + 7);
+                 }
+                 return own(std::move(out), {2, nq});
+             },
+             "(2, nq) slopes at the end of one path and the begin of the next, of the last "
+             "two and the first two postures (4, nq), at steps of the path parameter; closed "
+             "contacts do not move.")
         .def("time_law",
              [](Workspace& w, const std::vector<Packed>& contacts, const Array1<int>& stance,
                 const Array2<>& q, const Array2<>& slope, const Array2<>& inertia,

@@ -9,14 +9,63 @@ namespace {
 
 constexpr double RANK = 1e-4;  // of a regularisation against a direction of length one
 constexpr double LEAST = 1e-4;  // of an x that is always borne
+constexpr double SAME = 1e-9;   // a law goes on along the one above
+
+constexpr double DEPENDENT = 1e-8;  // a row is of those before it, against the longest
+
+double along(const double* a, const double* b, int n) {
+    double sum = 0.0;
+    for (int i = 0; i < n; ++i) sum += a[i] * b[i];
+    return sum;
+}
 
 }  // namespace
+
+void keep_closed(Kinematics& kin, const std::vector<Contact>& contacts, double* v) {
+    const Model& model = kin.model();
+    const int nv = model.nv;
+    std::vector<double> rows;
+    for (const Contact& c : contacts) {
+        const Surface& s = model.surfaces[c.surface];
+        const Vec3 p = kin.contact_point(c.surface, c.edge, model.supports[c.support].normal);
+        const int axes = s.flat && c.edge < 0 ? 6 : 3;
+        const std::size_t first = rows.size();
+        rows.resize(first + static_cast<std::size_t>(axes * nv), 0.0);
+        for (const int d : model.chain[s.body]) {
+            const Twist& t = kin.twist(d);
+            const Vec3 moves[2] = {t.v + cross(t.w, p), t.w};
+            for (int k = 0; k < axes; ++k) rows[first + k * nv + d] = moves[k / 3][k % 3];
+        }
+    }
+    const int n = static_cast<int>(rows.size()) / nv;
+    double longest = 0.0;
+    for (int i = 0; i < n; ++i) {
+        const double* const row = &rows[i * nv];
+        longest = std::max(longest, along(row, row, nv));
+    }
+    // Rows at right angles to each other, twice for rounding; v at right angles to them.
+    for (int i = 0; i < n; ++i) {
+        double* const row = &rows[i * nv];
+        const auto less = [nv](double* x, const double* unit) {
+            const double share = along(x, unit, nv);
+            for (int d = 0; d < nv; ++d) x[d] -= share * unit[d];
+        };
+        for (int pass = 0; pass < 2; ++pass)
+            for (int j = 0; j < i; ++j) less(row, &rows[j * nv]);
+        const double size = std::sqrt(along(row, row, nv));
+        const bool own = size > DEPENDENT * std::sqrt(longest);
+        for (int d = 0; d < nv; ++d) row[d] = own ? row[d] / size : 0.0;
+        less(v, row);
+    }
+}
 
 // Constraints in interval i: bounds of u and x, each in units of its own, and shares of a
 // weight along the cones' edges; balance; torques; x at the other end, to be bounded.
 void TimeLaw::pose(const Course& course, const std::vector<Contact>& contacts, int i,
                    double share) {
     const int nv = model_.nv, na = static_cast<int>(model_.dadr.size());
+    if (&contacts != posed_) active_.clear();
+    posed_ = &contacts;
     const Holding& held = planner_.look(contacts, course.q + i * model_.nq);
     const ContactPointsView points = held.points();
     const TorqueView torque = held.torque();
@@ -83,7 +132,24 @@ bool TimeLaw::solve(double u, double x) {
     qp.upper = upper_.data();
     qp.lower = lower_.data();
     qp.sense = sense_.data();
-    return solver_.solve(qp) > 0;
+    // From where the last one ended: the next interval's is much like it.
+    warm_ = sense_;
+    const bool known = active_.size() == sense_.size();
+    for (int i = 0; known && i < m_; ++i)
+        if (sense_[i] == INEQUALITY) warm_[i] = active_[i];
+    if (known) qp.sense = warm_.data();
+    int flag = solver_.solve(qp);
+    if (flag <= 0 && known) {
+        qp.sense = sense_.data();
+        flag = solver_.solve(qp);
+    }
+    active_.clear();
+    if (flag > 0)
+        for (int i = 0; i < m_; ++i) {
+            const int sense = solver_.active_set()[i];
+            active_.push_back(sense & ACTIVE ? sense & ACTIVE_LOWER : INEQUALITY);
+        }
+    return flag > 0;
 }
 
 void TimeLaw::fastest(const Course& course,
@@ -114,6 +180,11 @@ void TimeLaw::fastest(const Course& course,
     // As fast as can be, within that.
     x[0] = 0.0;
     for (int i = 0; i < n; ++i) {
+        const double along = x[i] + 2.0 * course.length[i] * slowing[i] * x[i];
+        if (x[i] == most[i] && along >= (1.0 - SAME) * most[i + 1]) {
+            x[i + 1] = most[i + 1];
+            continue;
+        }
         const double slow = course.u_slow[i] * (1.0 - x[i] / course.x_slow[i]);
         // Between rest and the law above, where rounding leaves nothing else.
         double u = slow >= 0.0 ? slow : slowing[i] * x[i];

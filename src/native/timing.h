@@ -26,6 +26,10 @@ struct Course {
     const double* damping = nullptr;   // (nv,) of the joints
 };
 
+// Take from the tangent vector v (nv) what moves contacts that are closed: their points,
+// and of links that lie flat how they turn.
+void keep_closed(Kinematics& kin, const std::vector<Contact>& contacts, double* v);
+
 class TimeLaw {
   public:
     explicit TimeLaw(PathPlanner& planner, const Model& model)
@@ -45,7 +49,8 @@ class TimeLaw {
     const Model& model_;
     QPSolver solver_;
     std::vector<double> H_, c_, A_, upper_, lower_, edges_, rows_;
-    std::vector<int> sense_;
+    std::vector<int> sense_, warm_, active_;
+    const std::vector<Contact>* posed_ = nullptr;
     int n_ = 0, m_ = 0;  // variables u, x, shares of the cones' edges; constraints
 };
 

@@ -158,9 +158,12 @@ def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
             fixed=c.fixed,
         )
 
+    # Most contacts are those of the stance before.
+    each = {id(c): c for s in sequence.stances for c in s.contacts}
+    brought = {i: move(c) for i, c in each.items()}
     stances = []
     for s in sequence.stances:
-        moved = tuple(x for x in map(move, s.contacts) if x is not None)
+        moved = tuple(x for c in s.contacts if (x := brought[id(c)]) is not None)
         posture = {n: turn @ u for n, u in s.posture.items()}
         stances.append(Stance(contacts=moved, posture=posture))
     return replace(

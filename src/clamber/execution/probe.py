@@ -60,7 +60,7 @@ def guarded_move(
     # No part of the way is faster than it should be, however far its nodes are apart.
     travel = np.abs(np.diff(phase.q[:, world.qadr], axis=0)).max(axis=1)
     speed = max(PROBE_SPEED * float((travel / np.diff(depths)).min()), 1e-3)
-    t = build_trajectory(world, [phase], speed=speed)
+    t = build_trajectory(ik.kin, [phase], speed=speed)
     a, b = t.segments[1].begin, t.segments[1].end  # without what is held
     cut = {n: getattr(t, n)[a:b] for n in ("q", "v", "tau", "contact")}
     # Between two postures at a joint's limit the spline passes it by a little.

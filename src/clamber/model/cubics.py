@@ -8,36 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 
-def smooth_slopes(x: np.ndarray, y: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """(n, k) slopes at x (n,) of the spline through y (n, k) without steps of bend.
-
-    Args:
-        x: Increasing.
-        y: At the nodes.
-        ends: (2, k) slopes at the first and the last of them.
-
-    Raises:
-        ValueError: Nodes do not increase, or a number is not finite.
-    """
-    h = np.diff(x)[:, None]
-    finite = all(np.isfinite(a).all() for a in (x, y, ends))
-    if len(y) != len(x) or len(h) == 0 or not finite or h.min() <= 0.0:
-        raise ValueError("nodes that increase, with finite points")
-    rise = np.diff(y, axis=0) / h
-    inner = 3.0 * (h[1:] * rise[:-1] + h[:-1] * rise[1:])
-    out = np.concatenate([ends[:1], inner, ends[1:]])
-    # Each slope and those beside it: three diagonals, of which the middle is largest.
-    above = np.concatenate([[[0.0]], h[:-1]])
-    middle = np.concatenate([[[1.0]], 2.0 * (h[:-1] + h[1:])])
-    for i in range(1, len(h)):
-        share = h[i] / middle[i - 1]
-        middle[i] -= share * above[i - 1]
-        out[i] -= share * out[i - 1]
-    for i in range(len(h) - 1, 0, -1):
-        out[i] = (out[i] - above[i] * out[i + 1]) / middle[i]
-    return out
-
-
 def monotone_slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(n, k) slopes at x (n,) of the curve through y (n, k) that nowhere overshoots.
 

@@ -53,7 +53,6 @@ class Kinematics:
         self.data = mujoco.MjData(m)
         self._jacp = np.zeros((3, m.nv))
         self._jacr = np.zeros((3, m.nv))
-        self._near = near_pairs(m, world.pairs)
         self._turn = np.zeros(3)
         # Views of the data: asking for them anew at each use costs more than the use.
         self._xpos = self.data.xpos
@@ -67,6 +66,10 @@ class Kinematics:
         """A workspace of the native core, without clearances beyond those asked for."""
         nothing = np.zeros(len(self.world.pairs))
         return _core.Workspace(core_of(self.world), nothing, nothing.astype(np.uint8))
+
+    @functools.cached_property
+    def _near(self) -> _core.Proximity:
+        return near_pairs(self.world.model, self.world.pairs)
 
     def update(self, q: np.ndarray) -> None:
         """Run forward kinematics for `q` (nq,)."""

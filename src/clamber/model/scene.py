@@ -242,6 +242,7 @@ class Box:
         friction: Coulomb coefficient of its faces.
         roughness: Unevenness of its faces [m]: links that are not in contact with them
             keep their distance plus this.
+        top: The face whose outward normal is most upright.
     """
 
     name: str
@@ -250,6 +251,7 @@ class Box:
     rotation: np.ndarray
     friction: float = 0.8
     roughness: float = 0.0
+    top: Support = field(init=False, repr=False)
 
     __repr__ = short_repr
 
@@ -258,10 +260,9 @@ class Box:
         object.__setattr__(self, "size", frozen_array(self.size, (3,)))
         object.__setattr__(self, "centre", frozen_array(self.centre, (3,)))
         object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
+        object.__setattr__(self, "top", self._top())
 
-    @property
-    def top(self) -> Support:
-        """The face whose outward normal is most upright."""
+    def _top(self) -> Support:
         axis = int(np.argmax(np.abs(self.rotation[2])))
         sign = 1.0 if self.rotation[2, axis] >= 0 else -1.0
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -383,6 +384,9 @@ class Scene:
         ground_friction: Coulomb coefficient of the ground.
         start: (3,) ankles' midpoint x, y [m] and yaw [rad].
         goal: (2,) pelvis x, y or (3,) with yaw; None for "on top of the first box".
+        ground: The plane z = 0.
+        tops: What may be climbed on: tops of the boxes in order, then those of meshes.
+        supports: The ground, then the tops.
     """
 
     boxes: tuple[Box, ...] = ()
@@ -390,11 +394,14 @@ class Scene:
     ground_friction: float = 0.8
     start: np.ndarray
     goal: np.ndarray | None = None
+    ground: Support = field(init=False, repr=False)
+    tops: tuple[Support, ...] = field(init=False, repr=False)
+    supports: tuple[Support, ...] = field(init=False, repr=False)
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        """Copy the arrays and check that names are unique."""
+        """Copy the arrays, check that names are unique, gather the supports."""
         object.__setattr__(self, "start", frozen_array(self.start, (3,)))
         if self.goal is not None:
             object.__setattr__(self, "goal", frozen_array(self.goal, (-1,)))
@@ -402,29 +409,18 @@ class Scene:
         names += [s.name for m in self.meshes for s in m.supports if s.name != m.name]
         if len({*names, GROUND}) != len(names) + 1:
             raise ValueError(f"names are not unique: {names}")
-
-    @property
-    def ground(self) -> Support:
-        """The plane z = 0."""
         s = GROUND_HALF_SIZE
-        return Support(
+        ground = Support(
             name=GROUND,
             position=np.zeros(3),
             rotation=np.eye(3),
             polygon=np.array([[-s, -s], [s, -s], [s, s], [-s, s]]),
             friction=self.ground_friction,
         )
-
-    @property
-    def supports(self) -> tuple[Support, ...]:
-        """Ground first, then the tops of the boxes in order, then those of meshes."""
-        return (self.ground, *self.tops)
-
-    @property
-    def tops(self) -> tuple[Support, ...]:
-        """What may be climbed on: the supports but for the ground."""
-        meshes = (s for m in self.meshes for s in m.supports)
-        return (*(b.top for b in self.boxes), *meshes)
+        tops = *(b.top for b in self.boxes), *(s for m in self.meshes for s in m.supports)
+        object.__setattr__(self, "ground", ground)
+        object.__setattr__(self, "tops", tops)
+        object.__setattr__(self, "supports", (ground, *tops))
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -273,8 +273,8 @@ def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:
         name="clamber_sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        width=128,
-        height=768,
+        width=32,
+        height=192,
         rgb1=[0.93, 0.95, 0.97],
         rgb2=[0.75, 0.80, 0.86],
     )
@@ -348,12 +348,14 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         home[model.joint(name).qposadr[0]] = angle
     data.qpos[:] = home
     mujoco.mj_kinematics(model, data)
-    surfaces = {s: _surface(model, data, s) for s in robot.surfaces}
+    names = [model.geom(g).name for g in range(model.ngeom)]
+    surfaces = {s: _surface(model, data, names, s) for s in robot.surfaces}
     pairs = _pairs(model, data, base)
     home = _stand_clear(model, data, robot, scene, home, surfaces, pairs)
     supports, leg = {s.name: s for s in scene.supports}, robot.limbs["left_leg"]
     geoms = _support_geoms(model, scene)
-    names = {g: name for name, g in reversed(geoms.items())}
+    named = {g: name for name, g in reversed(geoms.items())}
+    fixed = np.flatnonzero(model.geom_bodyid == 0).tolist()
     return World(
         model=model,
         xml=xml,
@@ -379,12 +381,12 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         support_of_geom={
             g: name
             for name in supports
-            for g in range(model.ngeom)
-            if model.geom_bodyid[g] == 0 and has_prefix(model.geom(g).name, name)
+            for g in fixed
+            if has_prefix(names[g], name)
         }
-        | names,
+        | named,
         supports=supports,
-        touching=_touching(model, scene, pairs, surfaces, geoms),
+        touching=_touching(model, scene, pairs, names, surfaces, geoms),
         base=base,
         mass=float(model.body_subtreemass[base]),
         length_scale=length_scale(
@@ -396,20 +398,22 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
     )
 
 
-def _surface(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Surface:
+def _surface(
+    model: mujoco.MjModel, data: mujoco.MjData, names: Sequence[str], name: str
+) -> Surface:
     """Contact geometry from the geoms that bear the surface's name.
 
     The geom with the bare name (else the first) is the one that plans: a sphere is a
     point surface, a capsule one at its lower end, a box or any other a flat surface,
     its face the one that looks down at home.
     """
-    geoms = [g for g in range(model.ngeom) if has_prefix(model.geom(g).name, name)]
-    main = next((g for g in geoms if model.geom(g).name == name), geoms[0])
+    geoms = [g for g, n in enumerate(names) if has_prefix(n, name)]
+    main = next((g for g in geoms if names[g] == name), geoms[0])
     body = int(model.geom_bodyid[main])
     bodies = {int(model.geom_bodyid[g]) for g in geoms}
     if len(bodies) > 1:
-        names = sorted(model.body(b).name for b in bodies)
-        raise InputError("one body for each surface", None, name, names)
+        several = sorted(model.body(b).name for b in bodies)
+        raise InputError("one body for each surface", None, name, several)
     kind, size = mujoco.mjtGeom(int(model.geom_type[main])), model.geom_size[main]
     p_BG, R_BG = model.geom_pos[main].copy(), matrix_from_quat(model.geom_quat[main])
     R_WB = data.xmat[body].reshape(3, 3)
@@ -621,6 +625,7 @@ def _touching(
     model: mujoco.MjModel,
     scene: Scene,
     pairs: np.ndarray,
+    names: Sequence[str],
     surfaces: Mapping[str, Surface],
     geoms: Mapping[str, int],
 ) -> dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]:
@@ -629,7 +634,7 @@ def _touching(
     A support of a mesh goes on in the pieces beside it: those that do not rise from it
     may touch like its own; those that rise gently, like further geoms of the surface.
     """
-    index = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
+    index = {(a, b): i for i, (a, b) in enumerate(pairs.tolist())}
     pieces = [
         (m.piece_name(i), p)
         for m in scene.meshes
@@ -643,7 +648,7 @@ def _touching(
             if geoms[name] != own[0] and rise is not None and rise < GENTLE:
                 (own if rise <= 0.0 else gentle).append(geoms[name])
         for name, surface in surfaces.items():
-            main = [g for g in surface.geoms if model.geom(g).name == surface.name]
+            main = [g for g in surface.geoms if names[g] == surface.name]
             if surface.is_flat:
                 main = list(surface.geoms)
 

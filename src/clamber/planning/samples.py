@@ -16,7 +16,6 @@ import numpy as np
 
 from clamber import _core
 from clamber.model import cubics
-from clamber.model.se3 import quat_conjugate, quat_multiply
 
 RATE = 1000.0  # [Hz]
 
@@ -161,22 +160,16 @@ class Spline:
         """(T, na), linear between two points of the grid."""
         return _core.between_rows(self.tau, self.grid, np.ascontiguousarray(s))
 
-    def along(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(T, nq) postures, and (T, nv) their derivatives by the path parameter."""
+    def along(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Along the path parameter, T places of it.
+
+        Returns:
+            (T, nq) postures, (T, nv) their derivatives by the path parameter as tangent
+            vectors, and (T, nv) the derivatives of those.
+        """
         return _core.along_spline(
             self.coefficients, self.nodes, np.ascontiguousarray(s)
         )
-
-    def bend(self, s: np.ndarray) -> np.ndarray:
-        """(T, nv) derivative of the tangent vector along the path."""
-        raw, slope, bend = cubics.along(self.coefficients, self.nodes, s)
-        norm = np.sum(raw[:, 3:7] ** 2, axis=1, keepdims=True)
-        inverse = quat_conjugate(raw[:, 3:7])
-        omega = 2.0 * quat_multiply(inverse, slope[:, 3:7])[:, 1:] / norm
-        stretch = 2.0 * np.sum(raw[:, 3:7] * slope[:, 3:7], axis=1, keepdims=True)
-        turn = 2.0 * quat_multiply(inverse, bend[:, 3:7])[:, 1:] / norm
-        turn -= stretch / norm * omega
-        return np.concatenate([bend[:, :3], turn, bend[:, 7:]], axis=1)
 
 
 def spline_through(
@@ -187,7 +180,7 @@ def spline_through(
     tau: np.ndarray,
 ) -> Spline:
     """The spline through postures (n, nq) at path parameters (n,); see `Spline`."""
-    slopes = cubics.smooth_slopes(s, postures, ends)
+    slopes = _core.smooth_slopes(s, postures, ends)
     c = cubics.pieces(s, postures, slopes)
     return Spline(c, postures, s, ends, grid, tau)
 
@@ -215,8 +208,8 @@ class Run:
     def motion(self) -> tuple[np.ndarray, np.ndarray]:
         """Configurations and velocities, rest included."""
         s, rate = self.timing
-        q, v = self.spline.along(s)
-        first, _ = self.spline.along(np.zeros(1))
+        q, v, _ = self.spline.along(s)
+        first, *_ = self.spline.along(np.zeros(1))
         v *= rate[:, None]
         still = np.zeros((1, v.shape[1]))
         return self._with_rest(first, q, q[-1:]), self._with_rest(still, v, still)

@@ -22,7 +22,6 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.se3 import quat_multiply
 from clamber.model.world import World
 from clamber.planning.samples import (
     RATE,
@@ -43,7 +42,7 @@ from clamber.planning.timing import (
 from clamber.step.change import Change
 from clamber.step.ik import IK
 from clamber.step.path import Phase, straightened
-from clamber.step.tasks import contact_rows, packed_contacts
+from clamber.step.tasks import packed_contacts
 
 HOLD_START = 0.3  # [s]
 HOLD_END = 2.0  # [s] the last posture is held
@@ -195,57 +194,19 @@ def _path(kin: Kinematics, phases: Sequence[Phase]) -> list[Spline]:
     parameters = [_arclength(kin, q) for q in postures]
     slopes = np.zeros((len(phases) + 1, 2, phases[0].q.shape[1]))
     for i in range(1, len(phases)):
-        before, after = postures[i - 1], postures[i]
-        tangent = _tangent(
-            kin,
-            before[-2:],
-            after[:2],
-            (parameters[i - 1][-1] - parameters[i - 1][-2], parameters[i][1]),
-            {c.surface: c for p in phases[i - 1 : i + 1] for c in p.contacts},
+        closed = {c.surface: c for p in phases[i - 1 : i + 1] for c in p.contacts}
+        slopes[i] = kin.core.tangents(
+            np.concatenate([postures[i - 1][-2:], postures[i][:2]]),
+            parameters[i - 1][-1] - parameters[i - 1][-2],
+            parameters[i][1],
+            STEEPER,
+            *packed_contacts(kin.world, list(closed.values())),
         )
-        for side, q in enumerate((before[-1], after[0])):
-            slopes[i, side] = _raw(q, tangent)
     unknown = np.zeros(0), np.zeros((0, 0))
     return [
         spline_through(s, q, np.stack([slopes[i, 1], slopes[i + 1, 0]]), *unknown)
         for i, (s, q) in enumerate(zip(parameters, postures, strict=True))
     ]
-
-
-def _tangent(
-    kin: Kinematics,
-    before: np.ndarray,
-    after: np.ndarray,
-    steps: tuple[float, float],
-    closed: dict[str, Contact],
-) -> np.ndarray:
-    """(nv,) where two phases join: none of the closed contacts moves.
-
-    Args:
-        kin: Workspace.
-        before: (2, nq) the last postures of the one.
-        after: (2, nq) the first of the other.
-        steps: Of the path parameter between them.
-        closed: By surface.
-    """
-    a, b = (kin.difference(*q) / h for q, h in zip((before, after), steps, strict=True))
-    ha, hb = steps
-    mean = (hb * a + ha * b) / (ha + hb)
-    most = STEEPER * np.minimum(np.abs(a), np.abs(b)) * (a * b > 0)
-    kin.update(after[0])
-    A = contact_rows(kin, closed.values())
-    return _along(A, np.clip(mean, -most, most))
-
-
-def _along(A: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """What is nearest to `v` (n,) of all that A (m, n) takes to zero."""
-    return v - np.linalg.pinv(A, rcond=1e-8) @ (A @ v)
-
-
-def _raw(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(nq,) derivative of raw coordinates that goes with a tangent vector (nv,)."""
-    turn = quat_multiply(q[3:7], np.array([0.0, *v[3:6]]))
-    return np.concatenate([v[:3], 0.5 * turn, v[6:]])
 
 
 def _arclength(kin: Kinematics, nodes: np.ndarray) -> np.ndarray:
@@ -264,7 +225,7 @@ def _made(phases: Sequence[Phase], i: int) -> Contact | None:
 
 
 def build_trajectory(
-    world: World,
+    kin: Kinematics,
     phases: Sequence[Phase],
     *,
     speed: Speed,
@@ -273,7 +234,7 @@ def build_trajectory(
     """Time the phases, all of them together.
 
     Args:
-        world: Robot and scene.
+        kin: Workspace.
         phases: In order; each begins with the last posture of the one before.
         speed: Largest joint speed [rad/s]; `max`: as fast as joints and contacts allow.
         keyframe_after: How many phases end before each keyframe is reached.
@@ -281,7 +242,7 @@ def build_trajectory(
     Raises:
         ValueError: Two phases do not join.
     """
-    kin = Kinematics(world)
+    world = kin.world
     surfaces = tuple(world.surfaces)
     runs = _runs(kin, phases, speed)
     lengths = [x.samples for x in runs]
@@ -319,9 +280,9 @@ def _course(
         fine = (edge[:-1, None] + np.diff(edge)[:, None] * _SHARES).ravel()
         most = [
             largest(x).reshape(-1, len(_SHARES)).max(axis=1)
-            for x in (spline.along(fine)[1], spline.bend(fine))
+            for x in spline.along(fine)[1:]
         ]
-        looked.append((*spline.along(middle), spline.bend(middle), *most))
+        looked.append((*spline.along(middle), *most))
         edges.append(starts[i] + edge[1:])
         middles.append(middle)
         made = _made(phases, i)
@@ -407,7 +368,7 @@ def timed(
             both = phases[i : i + 2]
             phases[i : i + 2] = straightened(ik, *both) or both
     ends = np.cumsum([len(lead), *(len(change.phases) for change in changes)])
-    return build_trajectory(world, phases, speed=speed, keyframe_after=ends.tolist())
+    return build_trajectory(ik.kin, phases, speed=speed, keyframe_after=ends.tolist())
 
 
 def _segments(
