@@ -33,7 +33,7 @@ def differences(a: Any, b: Any, at: str = "") -> Iterator[str]:
         for n in names:
             yield from differences(getattr(a, n), getattr(b, n), f"{at}.{n}")
     elif dataclasses.is_dataclass(a):
-        for f in dataclasses.fields(a):
+        for f in (f for f in dataclasses.fields(a) if f.init):  # the rest follows
             of = f"{at}.{f.name}"
             yield from differences(getattr(a, f.name), getattr(b, f.name), of)
     elif isinstance(a, (tuple, list)):

@@ -10,6 +10,8 @@ import pytest
 from scipy.optimize import nnls
 
 from clamber.model.kinematics import Kinematics
+from clamber.model.se3 import quat_conjugate, quat_multiply
+from clamber.planning.samples import spline_through
 from clamber.planning.timing import BASE_LENGTH
 from clamber.planning.trajectory import (
     HOLD_END,
@@ -26,6 +28,7 @@ from clamber.step.ik import IK
 from clamber.step.path import straightened
 from clamber.step.stability import statics_at
 from clamber.step.statics import Load, cone_generators, contact_forces
+from clamber.step.tasks import contact_rows, packed_contacts
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +51,50 @@ def velocity_errors(kin, trajectory, step: int) -> np.ndarray:
             for k in range(50, T - 50, 53)
         ]
     )
+
+
+def test_the_bend_is_the_derivative_of_the_tangent(demo_kinematics):
+    """Of a spline whose base turns fast: five places, central differences."""
+    rng, nv = np.random.default_rng(3), demo_kinematics.world.model.nv
+    q = np.tile(demo_kinematics.world.home, (4, 1))
+    for a, b in itertools.pairwise(range(4)):
+        q[b] = demo_kinematics.integrate(q[a], rng.normal(0.0, 0.5, nv))
+    s, none = np.array([0.0, 0.7, 1.2, 2.0]), np.zeros((2, q.shape[1]))
+    spline = spline_through(s, q, none, np.zeros(0), np.zeros((0, 0)))
+    at, h = np.array([0.05, 0.5, 0.9, 1.5, 1.9]), 1e-5
+    _, _, bend = spline.along(at)
+    _, before, _ = spline.along(at - h)
+    _, after, _ = spline.along(at + h)
+    assert np.abs(bend[:, 3:6]).min(axis=1).max() > 0.1
+    assert np.allclose(bend, (after - before) / (2.0 * h), atol=1e-6)
+
+
+def test_where_phases_join_no_closed_contact_moves(demo_plan, demo_kinematics):
+    """The tangent is the mean of both sides, less what would move a contact."""
+    kin, world = demo_kinematics, demo_plan.world
+    q, step = demo_plan.changes[2].phases[0].q[0], 0.2
+    contacts = demo_plan.changes[2].phases[0].contacts
+    rng = np.random.default_rng(5)
+    v = rng.normal(0.0, 0.3, world.model.nv)
+    rows = np.stack(
+        [kin.integrate(q, -step * v), q, q, kin.integrate(q, step * v)]
+    )  # the same speed on both sides
+    slope = kin.core.tangents(rows, step, step, 2.0, *packed_contacts(world, contacts))
+    assert np.array_equal(slope[0], slope[1])
+    kin.update(q)
+    A = contact_rows(kin, contacts)
+    along = v - np.linalg.pinv(A) @ (A @ v)
+    assert np.abs(A @ v).max() > 0.1
+    assert np.allclose(np.delete(slope[0], range(3, 7)), np.delete(along, range(3, 6)))
+    turn = quat_multiply(quat_conjugate(q[3:7]), 2.0 * slope[0, 3:7])
+    assert np.allclose(turn, [0.0, *along[3:6]])
+    # Another way, or far slower on one side: what both have, and twice that.
+    rows[3] = kin.integrate(q, -step * v)
+    turned = kin.core.tangents(rows, step, step, 2.0, *packed_contacts(world, ()))
+    assert not turned.any()
+    rows[3] = kin.integrate(q, 0.1 * step * v)
+    slower = kin.core.tangents(rows, step, step, 2.0, *packed_contacts(world, ()))
+    assert np.allclose(slower[1, 7:], 0.2 * v[6:])
 
 
 def test_samples_are_a_millisecond_apart(demo_plan):

@@ -387,10 +387,22 @@ _Solution = tuple[np.ndarray, int, bool, _Residuals]
 # Status, phase, depth or opening, pair, the posture that cannot be held.
 _Verdict = tuple[int, int, float, int, np.ndarray]
 
+def smooth_slopes(x: np.ndarray, y: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Slopes (n, k) at x (n,) of the spline through y (n, k) without steps of bend.
+
+    Args:
+        x: Increasing.
+        y: At the nodes.
+        ends: (2, k) slopes at the first and the last of them.
+
+    Raises:
+        ValueError: Nodes do not increase, or a number is not finite.
+    """
+
 def along_spline(
     c: np.ndarray, nodes: np.ndarray, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Postures (n, nq), tangent vectors (n, nv) along a cubic spline at s (n,).
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Along a cubic spline at s (n,): q (n, nq), dq/ds and d2q/ds2 (n, nv).
 
     Of the raw coordinates, c (4, k - 1, nq) as SciPy's `PPoly` has them between nodes
     (k,); rotations are normalised. The end pieces go on beyond the nodes.
@@ -524,6 +536,26 @@ class Workspace:
         """(n, na) torques that hold postures (n, nq); prices (n, k), or 0.
 
         Against generalised forces (n, nv) of inertia besides gravity's, or (0, 0).
+        """
+
+    def tangents(
+        self,
+        q: np.ndarray,
+        ha: float,
+        hb: float,
+        steeper: float,
+        what: np.ndarray,
+        where: np.ndarray,
+    ) -> np.ndarray:
+        """Slopes (2, nq) where one path ends and the next begins; contacts stay closed.
+
+        Args:
+            q: (4, nq) the last two postures of the one, the first two of the other.
+            ha: Path parameter between the first two.
+            hb: ... between the others.
+            steeper: Times the slower side, at most.
+            what: Closed contacts, packed.
+            where: Their numbers.
         """
 
     def time_law(

@@ -417,7 +417,8 @@ class Scene:
             polygon=np.array([[-s, -s], [s, -s], [s, s], [-s, s]]),
             friction=self.ground_friction,
         )
-        tops = *(b.top for b in self.boxes), *(s for m in self.meshes for s in m.supports)
+        meshes = (s for m in self.meshes for s in m.supports)
+        tops = (*(b.top for b in self.boxes), *meshes)
         object.__setattr__(self, "ground", ground)
         object.__setattr__(self, "tops", tops)
         object.__setattr__(self, "supports", (ground, *tops))

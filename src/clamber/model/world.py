@@ -379,10 +379,7 @@ def index_world(model: mujoco.MjModel, xml: str, robot: Robot, scene: Scene) -> 
         pairs=pairs,
         support_geom=geoms,
         support_of_geom={
-            g: name
-            for name in supports
-            for g in fixed
-            if has_prefix(names[g], name)
+            g: name for name in supports for g in fixed if has_prefix(names[g], name)
         }
         | named,
         supports=supports,

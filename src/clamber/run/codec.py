@@ -147,7 +147,7 @@ class Codec:
             return self.encode(form.write(x))
         out = {"type": type(x).__name__} if form.kinds else {}
         out |= {} if form.more is None else self.encode(form.more(x))
-        for f in fields(x):
+        for f in (f for f in fields(x) if f.init):
             value = getattr(x, f.name)
             plain = value is None or isinstance(value, (bool, str))
             if f.name in without or (plain and not value and value == f.default):
