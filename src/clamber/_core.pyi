@@ -181,6 +181,7 @@ class Filter:
 
     q: np.ndarray
     load: np.ndarray
+    least: float
 
     def __init__(
         self, q: list[float], surfaces: int, *, pose_share: float, force_share: float
@@ -192,6 +193,9 @@ class Filter:
 
     def watch(self, surfaces: list[int], normals: np.ndarray, pressed: float) -> None:
         """Have a controller decide where a surface is pressed along its normal [N]."""
+
+    def bear(self, surfaces: list[int], normals: np.ndarray) -> None:
+        """Have `least` be the least force on one of them along its normal [N]."""
 
 class Track:
     """Rows of a reference, one for each step; the present one."""
@@ -283,9 +287,7 @@ class Balance:
 
     def __init__(
         self,
-        xpos: np.ndarray,
-        xmat: np.ndarray,
-        com: np.ndarray,
+        model: Model,
         *,
         high: float,
         fade: float,
@@ -298,16 +300,13 @@ class Balance:
         settled: float,
         period: float,
     ) -> None:
-        """Looks at links (nbody, 3), (nbody, 9) and centre of mass (3,) in place."""
+        """Margins [m], gains, bounds and times [s] of the law."""
 
     def hold(self, bodies: list[int], local: np.ndarray, sole: np.ndarray) -> None:
         """Points (n, 3) of links bear, each `sole` (n, 3) farther in the world."""
 
-    def measured(self) -> None:
-        """The links are where they were measured."""
-
-    def planned(self) -> bool:
-        """The links are where they were planned; whether to move by `shift` (2,)."""
+    def update(self, q: np.ndarray, reference: np.ndarray) -> bool:
+        """Whether to move by `shift` (2,); postures (nq,) as measured, as planned."""
 
 class Loop:
     """The steps of a simulation, all but `mj_step` itself, and what is recorded."""

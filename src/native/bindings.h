@@ -56,6 +56,12 @@ inline void check_size(std::size_t n, std::size_t expected, const char* what) {
                                     " numbers, expected " + std::to_string(expected));
 }
 
+using In = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+
+inline void want(bool holds, const char* what) {
+    if (!holds) throw nb::value_error(what);
+}
+
 void bind_polygon(nb::module_& m);
 void bind_statics(nb::module_& m);
 void bind_geometry(nb::module_& m);
@@ -63,6 +69,7 @@ void bind_planes(nb::module_& m);
 void bind_model(nb::module_& m);
 void bind_posture(nb::module_& m);
 void bind_spline(nb::module_& m);
+void bind_balance(nb::module_& m);
 void bind_servo(nb::module_& m);
 
 }  // namespace clamber

@@ -12,5 +12,6 @@ NB_MODULE(_core, m) {
     clamber::bind_model(m);
     clamber::bind_posture(m);
     clamber::bind_spline(m);
+    clamber::bind_balance(m);
     clamber::bind_servo(m);
 }

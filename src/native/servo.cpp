@@ -6,9 +6,9 @@
 
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "bindings.h"
-#include "polygon.h"
 
 namespace clamber {
 
@@ -67,6 +67,13 @@ bool Filter::is_pressed() const {
     for (const auto& w : watched)
         if (dot(read3(&load[3 * w.surface]), w.normal) >= pressed) return true;
     return false;
+}
+
+double Filter::least() const {
+    double out = std::numeric_limits<double>::infinity();
+    for (const auto& b : bearing)
+        out = std::min(out, dot(read3(&load[3 * b.surface]), b.normal));
+    return out;
 }
 
 bool load_is_missing(const double* load, int ns, double weight, double share) {
@@ -152,62 +159,9 @@ void ContactForces::update(const Contacts& c) {
     }
 }
 
-void Balance::see(const double (*points)[2], int n, const double* com, Seen& out) const {
-    Polygon polygon;
-    support_polygon(points, n, polygon);
-    out.margin = com_margin(com[0], com[1], polygon);
-    double middle[2] = {0.0, 0.0};
-    for (int i = 0; i < n; ++i)
-        for (int a = 0; a < 2; ++a) middle[a] += points[i][a] / n;
-    out.points.clear();
-    for (int i = 0; i < n; ++i)
-        out.points.push_back({points[i][0] - middle[0], points[i][1] - middle[1]});
-    for (int a = 0; a < 2; ++a) out.com[a] = com[a] - middle[a];
-}
-
-bool Balance::feed_back(const Seen& now, const Seen& planned) {
-    // The contacts may be turned from where they were planned, all together.
-    double c = 0.0, s = 0.0;
-    for (size_t i = 0; i < now.points.size(); ++i) {
-        const auto &a = now.points[i], &b = planned.points[i];
-        c += a[0] * b[0] + a[1] * b[1];
-        s += a[0] * b[1] - a[1] * b[0];
-    }
-    const double n = std::hypot(c, s);
-    c = n > 0 ? c / n : 1.0, s = n > 0 ? s / n : 0.0;
-    const double e[2] = {c * now.com[0] - s * now.com[1] - planned.com[0],
-                         s * now.com[0] + c * now.com[1] - planned.com[1]};
-    const double inside = std::min(law_.high, planned.margin - law_.sag) - now.margin;
-    const double w = std::clamp(inside / law_.fade, 0.0, 1.0);
-    double move[2];
-    for (int a = 0; a < 2; ++a) {
-        const double rate = (e[a] - deviation_[a]) / (law_.smoothing + law_.period);
-        deviation_[a] += law_.period * rate;
-        // Where it is not needed it fades.
-        integral_[a] -=
-            law_.period / law_.t * (w * deviation_[a] + (1.0 - w) * integral_[a]);
-        move[a] = integral_[a] - w * (law_.p * deviation_[a] + law_.d * rate);
-    }
-    const auto bounded = [this](double* x) {
-        const double share = law_.most / std::max(std::hypot(x[0], x[1]), law_.most);
-        x[0] *= share, x[1] *= share;
-    };
-    bounded(integral_);
-    bounded(move);
-    std::copy_n(move, 2, shift);
-    if (w > 0.0 || std::hypot(integral_[0], integral_[1]) >= law_.settled) return true;
-    integral_[0] = integral_[1] = 0.0;
-    return false;
-}
-
 namespace {
 
-using In = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using InBool = nb::ndarray<const bool, nb::c_contig, nb::device::cpu>;
-
-void want(bool holds, const char* what) {
-    if (!holds) throw nb::value_error(what);
-}
 
 template <typename T>
 nb::ndarray<nb::numpy, T> view(T* data, std::initializer_list<size_t> shape, nb::handle owner) {
@@ -220,6 +174,17 @@ nb::object taken(std::vector<T>&& values, std::vector<size_t> shape) {
     auto* kept = new std::vector<T>(std::move(values));
     nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
     return nb::cast(nb::ndarray<nb::numpy, T>(kept->data(), shape.size(), shape.data(), owner));
+}
+
+std::vector<Filter::Watched> surfaces_along(const Filter& filter,
+                                            const std::vector<int>& surfaces, In normals) {
+    want(normals.size() == 3 * surfaces.size(), "a normal for each surface");
+    std::vector<Filter::Watched> out;
+    for (size_t i = 0; i < surfaces.size(); ++i) {
+        want(surfaces[i] >= 0 && surfaces[i] < filter.surfaces(), "rows of surfaces");
+        out.push_back({surfaces[i], read3(normals.data() + 3 * i)});
+    }
+    return out;
 }
 
 struct OwnTrack : Track {  // keeps the arrays of its rows
@@ -279,42 +244,6 @@ struct Follower {
     Reals commanded;  // (steps, nq)
 };
 
-
-// Balance on points of links, of one workspace of kinematics.
-struct BalanceOf {
-    BalanceOf(In xpos, In xmat, In com, const Balance::Law& law)
-        : xpos(xpos), xmat(xmat), com(com), balance(law) {}
-
-    void hold(std::vector<int> on, In local, In sole) {
-        want(local.size() == 3 * on.size() && sole.size() == local.size(),
-             "a link, a place on it and one from there for each point");
-        bodies = std::move(on);
-        points.clear();
-        for (size_t i = 0; i < bodies.size(); ++i) {
-            want(bodies[i] >= 0 && size_t(3 * bodies[i]) < xpos.size(), "links");
-            points.emplace_back(read3(local.data() + 3 * i), read3(sole.data() + 3 * i));
-        }
-        places.resize(points.size());
-    }
-    void look(Balance::Seen& out) {
-        for (size_t i = 0; i < points.size(); ++i) {
-            const Vec3 p = read3(xpos.data() + 3 * bodies[i]) +
-                           read9(xmat.data() + 9 * bodies[i]) * points[i].first +
-                           points[i].second;
-            places[i] = {p.x, p.y};
-        }
-        balance.see(reinterpret_cast<const double(*)[2]>(places.data()), int(places.size()),
-                    com.data(), out);
-    }
-
-    In xpos, xmat, com;
-    Balance balance;
-    std::vector<int> bodies;
-    std::vector<std::pair<Vec3, Vec3>> points;
-    std::vector<std::array<double, 2>> places;
-    Balance::Seen now, planned;
-};
-
 // The pelvis has tilted or sunk far from its reference, both (nq,).
 bool has_fallen(const double* q, const double* reference, double tilt, double height) {
     const auto upward = [](const Quat& t) {
@@ -340,35 +269,35 @@ const T* data_of(nb::handle array, std::ptrdiff_t* stride = nullptr) {
 }
 
 // The contacts of an `MjData`, by the names of MuJoCo's Python package. They begin its
-// arena, which stays where it is as long as the data: `deepest`, which is asked for after
-// every step, looks up how many there are, and where they lie only as often as `all` does.
-// An array of one says nothing of the distance between two, and an empty one not where it is.
+// arena, which stays where it is as long as the data: how many there are is asked for after
+// every step, where they lie only until two of them were seen. An array of one says nothing
+// of the distance between two, and an empty one not where it is.
 struct ListedContacts {
     explicit ListedContacts(nb::handle data)
         : data(nb::borrow(data)), contact(data.attr("contact")) {}
 
     double deepest() {
-        const int n = count();
-        if (n > 0 && known < 2) find_dist(n);
+        look();
         double out = 0.0;
-        for (int i = 0; i < n; ++i) out = std::max(out, -dist[i * dist_stride]);
+        for (int i = 0; i < seen.count; ++i) out = std::max(out, -dist[i * dist_stride]);
         return out;
     }
     Contacts all() {
-        Contacts c;
-        c.count = count();
-        find_dist(c.count);
-        c.geom = data_of<int>(nb::getattr(contact, geom_name), &c.geom_stride);
-        c.address = data_of<int>(nb::getattr(contact, address_name), &c.address_stride);
-        c.frame = data_of<double>(nb::getattr(contact, frame_name), &c.frame_stride);
-        c.force = data_of<double>(nb::getattr(data, force_name));
-        return c;
+        look();
+        seen.force = data_of<double>(nb::getattr(data, force_name));
+        return seen;
     }
-    void find_dist(int n) {
-        known = n;
+
+private:
+    void look() {
+        seen.count = nb::cast<int>(nb::getattr(data, count_name));
+        if (known) return;
+        known = seen.count > 1;
         dist = data_of<double>(nb::getattr(contact, dist_name), &dist_stride);
+        seen.geom = data_of<int>(nb::getattr(contact, geom_name), &seen.geom_stride);
+        seen.address = data_of<int>(nb::getattr(contact, address_name), &seen.address_stride);
+        seen.frame = data_of<double>(nb::getattr(contact, frame_name), &seen.frame_stride);
     }
-    int count() const { return nb::cast<int>(nb::getattr(data, count_name)); }
 
     nb::object data, contact;
     // Interned: that is what the interpreter finds quickly.
@@ -376,7 +305,8 @@ struct ListedContacts {
     nb::object count_name = name("ncon"), dist_name = name("dist"), geom_name = name("geom"),
                address_name = name("efc_address"), frame_name = name("frame"),
                force_name = name("efc_force");
-    int known = 0;  // how many there were when `dist` was looked up
+    bool known = false;
+    Contacts seen;
     const double* dist = nullptr;
     std::ptrdiff_t dist_stride = 0;
 };
@@ -534,14 +464,13 @@ void bind_servo(nb::module_& m) {
             self.update(q.data(), force.data());
         })
         .def("watch", [](Filter& self, std::vector<int> surfaces, In normals, double pressed) {
-            want(normals.size() == 3 * surfaces.size(), "a normal for each surface");
-            self.watched.clear();
-            for (size_t i = 0; i < surfaces.size(); ++i) {
-                want(surfaces[i] >= 0 && surfaces[i] < self.surfaces(), "rows of surfaces");
-                self.watched.push_back({surfaces[i], read3(normals.data() + 3 * i)});
-            }
+            self.watched = surfaces_along(self, surfaces, normals);
             self.pressed = pressed;
         })
+        .def("bear", [](Filter& self, std::vector<int> surfaces, In normals) {
+            self.bearing = surfaces_along(self, surfaces, normals);
+        })
+        .def_prop_ro("least", &Filter::least)
         .def_prop_ro("q", [](nb::handle_t<Filter> self) {
             auto& f = nb::cast<Filter&>(self);
             return view(f.q.data(), {f.q.size()}, self);
@@ -648,24 +577,6 @@ void bind_servo(nb::module_& m) {
         .def("recorded", &Loop::recorded)
         .def_ro("count", &Loop::count)
         .def_ro("fell", &Loop::fell);
-    nb::class_<BalanceOf>(m, "Balance")
-        .def("__init__", [](BalanceOf* self, In xpos, In xmat, In com, double high, double fade,
-                            double sag, double p, double d, double t, double most,
-                            double smoothing, double settled, double period) {
-            new (self) BalanceOf(xpos, xmat, com, {high, fade, sag, p, d, t, most, smoothing,
-                                                   settled, period});
-        }, nb::arg("xpos"), nb::arg("xmat"), nb::arg("com"), nb::kw_only(), nb::arg("high"),
-           nb::arg("fade"), nb::arg("sag"), nb::arg("p"), nb::arg("d"), nb::arg("t"),
-           nb::arg("most"), nb::arg("smoothing"), nb::arg("settled"), nb::arg("period"))
-        .def("hold", &BalanceOf::hold, nb::arg("bodies"), nb::arg("local"), nb::arg("sole"))
-        .def("measured", [](BalanceOf& self) { self.look(self.now); })
-        .def("planned", [](BalanceOf& self) {
-            self.look(self.planned);
-            return self.balance.feed_back(self.now, self.planned);
-        })
-        .def_prop_ro("shift", [](BalanceOf& self) {
-            return taken(Reals(self.balance.shift, self.balance.shift + 2), {2});
-        });
     m.attr("SCENE") = ContactForces::kScene;
     m.attr("OTHER") = ContactForces::kOther;
     m.def("load_is_missing", [](In load, double weight, double share) {

@@ -58,11 +58,13 @@ public:
     void update(const double* q, const double* force);
     // Is one of the surfaces that are watched pressed along its normal so much [N]?
     bool is_pressed() const;
+    // The least force along its normal on one of the surfaces that should bear [N].
+    double least() const;
     int surfaces() const { return int(load.size()) / 3; }
 
     Reals q, load;  // (nq,), (ns, 3) [N]
     struct Watched { int surface; Vec3 normal; };
-    std::vector<Watched> watched;
+    std::vector<Watched> watched, bearing;
     double pressed = 0.0;
 
 private:
@@ -155,33 +157,6 @@ public:
 
 private:
     std::vector<int> row_;
-};
-
-// The centre of mass near the border of its support: where to move it, from how far it
-// is from its plan, seen from the points that bear.
-class Balance {
-public:
-    struct Law {
-        double high, fade, sag;   // [m] margins at which it sets in
-        double p, d, t, most;     // gain, [s] of rate and integral, [m] bound
-        double smoothing, settled;  // [s] of the deviation, [m] that is nothing
-        double period;            // [s]
-    };
-    explicit Balance(const Law& law) : law_(law) {}
-    struct Seen {
-        double com[2] = {0.0, 0.0}, margin = 0.0;  // from the middle of the points
-        std::vector<std::array<double, 2>> points;
-    };
-    // Of the points (n, 2) that bear load.
-    void see(const double (*points)[2], int n, const double* com, Seen& out) const;
-    // False where there is nothing to move; else `shift` is where to.
-    bool feed_back(const Seen& now, const Seen& planned);
-
-    double shift[2] = {0.0, 0.0};
-
-private:
-    Law law_;
-    double deviation_[2] = {0.0, 0.0}, integral_[2] = {0.0, 0.0};
 };
 
 }  // namespace clamber

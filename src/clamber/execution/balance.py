@@ -22,6 +22,7 @@ import numpy as np
 
 from clamber import _core
 from clamber.contact.contact import Contact
+from clamber.model.core import core_of
 from clamber.model.kinematics import Kinematics
 from clamber.model.world import World
 from clamber.step.tasks import contact_rows
@@ -45,11 +46,9 @@ class Balance:
 
     def __init__(self, world: World, period: float) -> None:
         """Feed back every `period` [s]."""
-        self._kin = kin = Kinematics(world)
+        self._kin = Kinematics(world)
         self._core = _core.Balance(
-            kin.data.xpos,
-            kin.data.xmat,
-            kin.com,
+            core_of(world),
             high=HIGH * world.length_scale,
             fade=FADE * world.length_scale,
             most=MOST * world.length_scale,
@@ -74,17 +73,13 @@ class Balance:
         Returns:
             Whether the goal is another one.
         """
-        kin = self._kin
         if not contacts:
             return False
         if contacts is not self._contacts:
             self._hold(contacts)
-        kin.update(q)
-        self._core.measured()
-        kin.update(reference)
-        acted, self._acts = self._acts, self._core.planned()
+        acted, self._acts = self._acts, self._core.update(q, reference)
         if acted or self._acts:
-            self.goal[:] = self._moved() if self._acts else 0.0
+            self.goal[:] = self._moved(reference) if self._acts else 0.0
         return acted or self._acts
 
     def _hold(self, contacts: Sequence[Contact]) -> None:
@@ -99,9 +94,10 @@ class Balance:
         self._core.hold(bodies, np.concatenate(local), np.concatenate(sole))
         self._contacts = contacts
 
-    def _moved(self) -> np.ndarray:
+    def _moved(self, reference: np.ndarray) -> np.ndarray:
         """(na,) that moves the centre of mass as is asked for, the contacts held."""
         kin = self._kin
+        kin.update(reference)
         com = kin.com_jacobian()[:2].copy()
         A = np.concatenate([com, contact_rows(kin, self._contacts)])
         wanted = np.zeros(len(A))

@@ -67,6 +67,7 @@ class Estimate:
     def believe(self, world: World) -> None:
         """Take the world to be like this."""
         self.world, self.kin = world, Kinematics(world)
+        self._asked: Sequence[Contact] | None = None  # whether all of them bear
 
     def update(self, m: Measurement) -> None:
         """Take in the measurement of one physics step."""
@@ -79,9 +80,7 @@ class Estimate:
             contacts: Of the surfaces.
             force: None: `touch`.
         """
-        rows = [self.row(c.surface) for c in contacts]
-        normals = [self.world.supports[c.support].normal for c in contacts]
-        self.filter.watch(rows, np.array(normals).reshape(-1, 3), force or self.touch)
+        self.filter.watch(*self._along(contacts), force or self.touch)
 
     def row(self, surface: str) -> int:
         """Of a surface in the forces."""
@@ -91,6 +90,19 @@ class Estimate:
         """Normal force on a contact's surface [N]."""
         n = self.world.supports[c.support].normal
         return float(self.load[self.row(c.surface)] @ n)
+
+    def all_bear(self, contacts: Sequence[Contact]) -> bool:
+        """Whether none of the contacts, which are looked at often, is `lost`."""
+        if contacts is not self._asked:
+            self._asked = contacts
+            self.filter.bear(*self._along(contacts))
+        return self.filter.least >= self.lost
+
+    def _along(self, contacts: Sequence[Contact]) -> tuple[list[int], np.ndarray]:
+        """Rows of surfaces, and normals (n, 3) of their supports."""
+        normals = [self.world.supports[c.support].normal for c in contacts]
+        rows = [self.row(c.surface) for c in contacts]
+        return rows, np.array(normals).reshape(-1, 3)
 
     def point(self, c: Contact) -> np.ndarray:
         """(3,) where the surface's lowest point is."""

@@ -362,8 +362,10 @@ class Executive:
         """The contact, or that of another surface of the limb in its place."""
         return self.estimate.substitute(c) or c
 
-    def _has_slipped(self, stance: Iterable[Contact]) -> bool:
+    def _has_slipped(self, stance: Sequence[Contact]) -> bool:
         """Is a limb back on another support?"""
+        if self.estimate.all_bear(stance):
+            return False
         return any(self._actual(c).support != c.support for c in stance)
 
     def _is_elsewhere(self, c: Contact) -> bool:

@@ -66,7 +66,7 @@ class Reference:
     @property
     def i(self) -> int:
         """The sample of the trajectory that was reached."""
-        return int(np.floor(self._place + 1e-9))
+        return math.floor(self._place + 1e-9)
 
     @property
     def _place(self) -> float:

@@ -16,14 +16,12 @@ what is left to it is its feed-forward torque and its damping.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
-import mujoco
 import numpy as np
 
 from clamber import _core
-from clamber.model.world import PHYSICS_STEP, World, chain_up, recompiled
+from clamber.model.world import PHYSICS_STEP, World, chain_up, with_gains
 from clamber.planning.timing import Speed
 
 ControlMode = Literal["pid", "mixed"]
@@ -41,15 +39,7 @@ def driven_world(world: World, mode: ControlMode) -> World:
     soft = world.robot.impedance
     if mode == "pid" or not soft:
         return world
-
-    def soften(spec: mujoco.MjSpec) -> None:
-        for name, (kp, kd) in soft.items():
-            spec.actuator(name).set_to_position(kp=kp, kv=kd)
-
-    gains = {**world.robot.gains, **{n: (*g, 0.0) for n, g in soft.items()}}
-    robot = replace(world.robot, gains=gains)
-    out = recompiled(world, soften, robot)
-    return replace(out, robot=world.robot, home=world.home)
+    return with_gains(world, {name: (*g, 0.0) for name, g in soft.items()})
 
 
 def joint_servo(world: World) -> _core.JointServo:

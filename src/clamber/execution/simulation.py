@@ -176,14 +176,14 @@ def simulate(
         push=push,
         steps=len(plan.trajectory.time) + round(AHEAD / PHYSICS_STEP),
     )
-    runs = True
+    runs, step = True, loop.step
     while runs:
         k = loop.count
         share = min(k / max(len(plan.trajectory.time), k + follower.left), 1.0)
         report("simulate", share, f"{k * PHYSICS_STEP:.0f} s")
         sensors.draw()
         for _ in range(BLOCK):
-            runs = loop.step(follower)
+            runs = step(follower)
             if not runs:
                 break
             mujoco.mj_step(model, data)

@@ -191,27 +191,38 @@ def build_world(robot: RobotLike, scene: SceneLike) -> World:
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.quality.shadowsize = 4096
     _add_scene(spec, scene)
-    return _written(spec, robot, scene)
+    return index_world(*_written(spec, robot), robot, scene)
 
 
-def recompiled(
-    world: World, edit: Callable[[mujoco.MjSpec], None], robot: Robot | None = None
-) -> World:
-    """The world whose model is edited.
+def recompiled(world: World, edit: Callable[[mujoco.MjSpec], None]) -> World:
+    """The world whose model is edited, which stays as it is."""
+    return index_world(*_edited(world, edit), world.robot, world.scene)
 
-    Args:
-        world: Stays as it is.
-        edit: Changes the spec that it is given.
-        robot: With the gains that the edited model has; None: as before.
-    """
+
+def with_gains(world: World, gains: Mapping[str, tuple[float, float, float]]) -> World:
+    """The world with other servos at some joints: kp, kd and ki by name."""
+
+    def retuned(spec: mujoco.MjSpec) -> None:
+        for name, (kp, kd, _) in gains.items():
+            spec.actuator(name).set_to_position(kp=kp, kv=kd)
+
+    model, xml = _edited(world, retuned)
+    old = zip(world.joints, world.kp, world.kd, world.ki, strict=True)
+    kp, kd, ki = np.array([gains.get(name, now) for name, *now in old]).T
+    return replace(world, model=model, xml=xml, kp=kp, kd=kd, ki=ki)
+
+
+def _edited(
+    world: World, edit: Callable[[mujoco.MjSpec], None]
+) -> tuple[mujoco.MjModel, str]:
     spec = mujoco.MjSpec.from_string(world.xml)
     spec.modelfiledir = str(world.robot.path.parent)
     edit(spec)
-    return _written(spec, robot or world.robot, world.scene)
+    return _written(spec, world.robot)
 
 
-def _written(spec: mujoco.MjSpec, robot: Robot, scene: Scene) -> World:
-    """The world of the MJCF that a spec is written as.
+def _written(spec: mujoco.MjSpec, robot: Robot) -> tuple[mujoco.MjModel, str]:
+    """The model of the MJCF that a spec is written as, and that.
 
     Written numbers are rounded: whoever plans or simulates uses what a reader of the
     file will.
@@ -220,7 +231,7 @@ def _written(spec: mujoco.MjSpec, robot: Robot, scene: Scene) -> World:
     xml = spec.to_xml()
     again = mujoco.MjSpec.from_string(xml)
     again.modelfiledir = str(robot.path.parent)
-    return index_world(again.compile(), xml, robot, scene)
+    return again.compile(), xml
 
 
 def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
