@@ -212,9 +212,7 @@ def settled(row: Row, done: Done, refused: str) -> bool:
 def why_not(done: Done) -> str:
     """What a command that missed its goal said of it."""
     record = done.record
-    missed = [n for n, c in record.get("criteria", {}).items() if not c["ok"]]
-    said = ["not met: " + ", ".join(missed)] if missed else []
-    said += [str(record[k]) for k in ("stopped", "reason") if record.get(k)]
+    said = [str(record[k]) for k in ("note", "reason") if record.get(k)]
     said += list(dict.fromkeys(record.get("failures", [])))[-2:]
     return "; ".join(said) or done.last
 

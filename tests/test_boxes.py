@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from clamber import _core
+from clamber.contact.contact import ContactSequence
 from clamber.errors import InputError
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
 from clamber.model.terrain import load_scene
 from clamber.planning.diagnose import check_scene
+from clamber.run.folder import save_sequence
 from clamber.step.statics import contact_angle
 
 
@@ -64,6 +67,66 @@ def test_boxes_and_ground_of_an_mjcf(tmp_path):
     np.testing.assert_allclose(scene.boxes[1].centre, [2, 0, 0.2])
     turned = matrix_from_rpy([0, 0, 0.3])
     np.testing.assert_allclose(scene.boxes[0].rotation, turned, atol=1e-9)
+
+
+UNNAMED = """<mujoco><worldbody>
+  <geom type="box" size="0.5 0.6 0.1" pos="0.8 0 0.1"/>
+  <geom type="sphere" size="0.2" pos="4 0 0.2"/>
+  <body name="table" pos="2 0 0.1"><geom type="box" size="0.2 0.2 0.1"/>
+    <geom type="box" size="0.1 0.1 0.1" pos="0 1 0" friction="{mu}"/></body>
+</worldbody></mujoco>"""
+
+
+def test_an_unnamed_geom_is_called_by_its_place(tmp_path):
+    path = tmp_path / "w.xml"
+    path.write_text(UNNAMED.format(mu=0.7))
+    scene = load_scene(path)
+    assert [b.name for b in scene.boxes] == ["box1", "table", "table2"]
+    assert [m.name for m in scene.meshes] == ["box2"]
+    path.write_text(UNNAMED.format(mu=1.5))
+    with pytest.raises(InputError, match=r"'table2' at \(2, 1, 0\.1\).*friction"):
+        load_scene(path)
+
+
+SOLIDS = """boxes:
+  - {name: box, size: [1, 1, 0.5], position: [0, 0, 0.25]}
+meshes:
+  - {name: mesh, file: m.obj, position: [2, 0, 0.25]}
+heightfields:
+  - {name: heights, file: h.npy, size: [1, 1], position: [4, 0, 0.25]}
+"""
+
+
+def test_the_third_number_of_position_is_the_lower_face_in_files_and_python(tmp_path):
+    corner = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)]) - [0.5, 0.5, 0]
+    faces = [[int(i) + 1 for i in f] for f in TRIANGLES.split()]
+    obj = ["v {} {} {}".format(*v) for v in corner * [1, 1, 0.5]]
+    obj += ["f {} {} {}".format(*f) for f in faces]
+    (tmp_path / "m.obj").write_text("\n".join(obj))
+    np.save(tmp_path / "h.npy", np.array([[0.0, 0.5], [0.5, 0.5]]))
+    (tmp_path / "s.yaml").write_text(SOLIDS)
+    scene = load_scene(tmp_path / "s.yaml")
+    (box,) = scene.boxes
+    assert [corners(box)[:, 2].min(), box.top.position[2]] == [0.25, 0.75]
+    mesh, heights = scene.meshes
+    z = np.concatenate(mesh.pieces)[:, 2]
+    assert [z.min(), z.max()] == pytest.approx([0.25, 0.75], abs=1e-6)
+    assert max(s.vertices[:, 2].max() for s in heights.supports) == pytest.approx(0.75)
+    assert min(s.vertices[:, 2].min() for s in heights.supports) == pytest.approx(0.25)
+    # Python's record has no position that could mean another face.
+    assert not hasattr(box, "position")
+    assert box.centre[2] == 0.5
+    # What is written of it is a scene file again.
+    only_box = Scene(boxes=(box,), start=np.zeros(3))
+    sequence = ContactSequence(
+        source="none", subject=None, scene=only_box, stances=(), t=np.zeros(1)
+    )
+    save_sequence(sequence, tmp_path / "sequence.json")
+    written = json.loads((tmp_path / "sequence.json").read_text())["scene"]["boxes"]
+    assert written[0]["position"] == [0.0, 0.0, 0.25]
+    (tmp_path / "t.yaml").write_text(json.dumps({"boxes": written}))
+    again = load_scene(tmp_path / "t.yaml").boxes[0]
+    np.testing.assert_array_equal(again.centre, box.centre)
 
 
 def test_a_scene_names_a_drawing(tmp_path, rng):

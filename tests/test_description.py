@@ -112,6 +112,22 @@ def test_the_same_holds_for_meshes_and_textures_of_an_mjcf(tmp_path, solid):
         assert compile_description(found, path).nmesh == 0
 
 
+def test_commas_between_numbers_of_an_mjcf_are_blanks(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "m.stl").write_bytes(stl(CUBE))
+    path = tmp_path / "r.xml"
+    path.write_text(
+        """<mujoco><compiler meshdir="meshes"/><asset><mesh file="m.stl"/></asset>
+        <worldbody><body name="a,1" pos="1, 2,3" quat="0.5,0.5,0.5,0.5">
+        <geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
+    )
+    found = read_description(path)
+    assert found.notes == ("commas between numbers are taken for blanks",)
+    body = compile_description(found, path).body("a,1")
+    np.testing.assert_allclose(body.pos, [1, 2, 3])
+    np.testing.assert_allclose(body.quat, 0.5)
+
+
 def test_what_an_mjcf_includes_is_found_beside_it(tmp_path, monkeypatch):
     text = humanoids.mjcf()
     start = text.index('<body name="t1"')
@@ -242,10 +258,34 @@ def test_a_file_that_stands_in_anothers_place_is_told(tmp_path):
         load_robot(tmp_path / "robot.yaml")
 
 
-def test_macros_of_xacro_are_asked_to_be_expanded(tmp_path):
-    text = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:leg/></robot>'
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        "<xacro:leg/>",
+        '<link name="a"/><xacro:include filename="leg.xacro"/>',
+        '<link name="a"/><xacro:leg x="1"/><xacro:macro name="leg" params="x"/>',
+        '<link name="${side}_leg"/>',
+    ],
+)
+def test_macros_of_xacro_are_asked_to_be_expanded(tmp_path, inside):
+    text = f"<robot {XACRO}>{inside}</robot>"
     with pytest.raises(InputError, match="expand the macros"):
         read_description(written(tmp_path, text))
+
+
+def test_what_xacro_left_of_macros_that_nothing_defines_does_not_matter(tmp_path):
+    whole = humanoids.urdf()
+    left = whole.replace("<robot ", f"<robot {XACRO} ", 1)
+    left = left.replace("</robot>", '<xacro:imu port="none"/></robot>')
+    path = written(tmp_path, left)
+    found = read_description(path)
+    assert found.notes == ("macros that the file does not define are left out: imu",)
+    model = compile_description(found, path)
+    plain = written(tmp_path, whole)
+    assert model.nbody == compile_description(read_description(plain), plain).nbody
 
 
 def test_a_document_in_another_encoding_hides_nothing(tmp_path):

@@ -359,6 +359,7 @@ def conclude(
         note = f"failed: not met: {wrong}" if wrong else "failed: nothing was planned"
     if rollout is not None and not reached:
         note += _strained(rollout)
+    record["note"] = note
     tables = keyframe_tables(planned) if clock is not None else []
     tables += skipped_tables(plan)
     if rollout is not None and rollout.events:

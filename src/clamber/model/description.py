@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import io
 import os
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -83,9 +84,7 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
     notes: list[str] = []
     try:
         if root.tag == "robot":
-            if any("wiki/xacro}" in e.tag for e in root.iter()):
-                expected = "a URDF: expand the macros with `xacro FILE > FILE.urdf`"
-                raise InputError(expected, path)
+            _without_macros(root, path, notes)
             mimics = {
                 str(j.get("name")): str(m.get("joint"))
                 for j in root.findall("joint")
@@ -100,7 +99,7 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
             spec = mujoco.MjSpec.from_string(text)
         elif root.tag in ("mujoco", "mujocoinclude"):
             _check_numbers(root, path)
-            spec = mujoco.MjSpec.from_file(str(path))
+            spec = _read_mjcf(root, path, notes)
             mimics = {
                 str(e.name1): str(e.name2)
                 for e in spec.equalities
@@ -116,6 +115,47 @@ def read_description(path: Path, *, lenient: bool = False) -> Description:
     except ValueError as e:
         raise InputError(f"a model that MuJoCo loads ({_one_line(e)})", path) from e
     return Description(spec=spec, mimics=mimics, notes=tuple(notes))
+
+
+def _without_macros(root: ElementTree.Element, path: Path, notes: list[str]) -> None:
+    """Leave out what xacro left of macros that nothing defines.
+
+    Raises:
+        InputError: There is something that xacro would expand.
+    """
+    macros = {e for e in root.iter() if "wiki/xacro}" in e.tag}
+    names = [e.tag.rpartition("}")[2] for e in macros]
+    values = (v for e in root.iter() for v in e.attrib.values())
+    defined = {"include", "macro", "property", "arg", "if", "unless", "insert_block"}
+    missing = macros and root.find("link") is None
+    if missing or defined & {*names} or any("${" in v for v in values):
+        expected = "a URDF: expand the macros with `xacro FILE > FILE.urdf`"
+        raise InputError(expected, path)
+    for parent in list(root.iter()):
+        parent[:] = [e for e in parent if e not in macros]
+    if names:
+        said = ", ".join(sorted({*names}))
+        notes.append(f"macros that the file does not define are left out: {said}")
+
+
+def _read_mjcf(
+    root: ElementTree.Element, path: Path, notes: list[str]
+) -> mujoco.MjSpec:
+    """As MuJoCo reads it; commas between numbers, which older ones took, are blanks."""
+    with_commas = {
+        (e, name)
+        for e in root.iter()
+        for name, value in e.attrib.items()
+        if "," in value and re.fullmatch(r"[\s\d.,eE+-]+", value)
+    }
+    if not with_commas or root.find(".//include") is not None:
+        return mujoco.MjSpec.from_file(str(path))
+    for e, name in with_commas:
+        e.set(name, e.attrib[name].replace(",", " "))
+    notes.append("commas between numbers are taken for blanks")
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    spec.modelfiledir = str(path.parent)
+    return spec
 
 
 def _check_numbers(root: ElementTree.Element, path: Path) -> None:

@@ -329,6 +329,7 @@ def read_drawn(
     names = [b.name for b in (*boxes, *shapes)]
     for b in (*boxes, *shapes):
         fault = None
+        at = b.vertices.mean(axis=0) if isinstance(b, Shape) else b.centre
         points = b.vertices if isinstance(b, Shape) else [b.size, b.centre]
         if names.count(b.name) > 1 or b.name == GROUND or not re.match(NAME, b.name):
             fault = f"a name of its own of letters, digits and _, not {GROUND!r}"
@@ -338,7 +339,8 @@ def read_drawn(
             fault = f"a friction above 0, at most 1, not {b.friction:g}"
         if fault:
             kind = "shape" if isinstance(b, Shape) else "box"
-            raise InputError(fault, path, f"{kind} {b.name!r}")
+            where = "({:.3g}, {:.3g}, {:.3g})".format(*at)  # its file may not name it
+            raise InputError(fault, path, f"{kind} {b.name!r} at {where}")
     if ground is not None and not 0 < ground <= 1:
         raise InputError("a friction above 0, at most 1", path, "ground", ground)
     return (boxes, shapes), ground
