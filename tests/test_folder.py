@@ -26,6 +26,7 @@ from clamber.execution.verdict import Verdict
 from clamber.model.robot import ROBOTS
 from clamber.model.scene import Box, Scene
 from clamber.model.se3 import matrix_from_rpy
+from clamber.model.world import recompiled
 from clamber.planning.records import Plan
 from clamber.planning.trajectory import Samples, timed
 from clamber.run.folder import (
@@ -53,6 +54,7 @@ from clamber.run.folder import (
 )
 from clamber.step.change import Failure
 from records import differences, same
+from support.files import box_obj
 
 PLAN_FILES = {
     *("sequence.json", "plan.json", "planned.xml", "planned.npz", "timings.json"),
@@ -477,6 +479,29 @@ def test_meshes_travel_with_the_scene(plan: Plan, tmp_path: Path):
     model = mujoco.MjModel.from_xml_path(str(out / "scene.xml"))
     assert model.nmesh == 2
     assert {p.name for p in (out / "assets").iterdir()} == {"a.obj", "a-2.obj"}
+
+
+def test_a_run_of_a_robot_with_meshes_is_simulated_from_its_folder(
+    plan: Plan, tmp_path: Path
+):
+    path = tmp_path / "robot" / "a.obj"
+    path.parent.mkdir()
+    path.write_text(box_obj([0.1, 0.1, 0.1], [0, 0, 0], 0.0))
+    robot = replace(plan.world.robot, path=path.parent / "robot.xml")
+
+    def add_mesh(spec: mujoco.MjSpec) -> None:
+        spec.add_mesh(name="a", file="a.obj")
+        kind = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "a"}
+        spec.body("Waist").add_geom(**kind, contype=0, conaffinity=0, mass=0.0)
+
+    world = recompiled(replace(plan.world, robot=robot), add_mesh)
+    save_plan(replace(plan, world=world), tmp_path / "run")
+    save_sequence(plan.sequence, tmp_path / "run" / SEQUENCE)
+    shutil.rmtree(path.parent)
+    found = load_plan(tmp_path / "run")
+    assert recompiled(found.world, lambda spec: None).model.nmesh == 1
+    save_plan(found, tmp_path / "again")
+    assert (tmp_path / "again" / "assets" / "a.obj").is_file()
 
 
 # Rollouts and verdicts.

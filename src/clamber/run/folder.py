@@ -424,7 +424,8 @@ def _load_timings(folder: Path) -> dict[str, float]:
 def _load_world(path: Path, robot: Robot, scene: Scene) -> World:
     try:
         model = mujoco.MjSpec.from_file(str(path)).compile()
-        world = index_world(model, path.read_text(), robot, scene)
+        text = _with_folder(path.read_text(), path.parent.resolve())
+        world = index_world(model, text, robot, scene)
         for limb in robot.limbs.values():
             for name in (limb.root, limb.middle, limb.end):
                 world.landmark(name)
@@ -449,6 +450,18 @@ def _save_world(world: World, path: Path) -> None:
         text = ElementTree.tostring(root, encoding="unicode") + "\n"
     with whole_file(path) as draft:
         draft.write_text(text)
+
+
+def _with_folder(text: str, folder: Path) -> str:
+    """An MJCF whose files are named from the root: worlds seek theirs by the robot."""
+    if "file=" not in text:
+        return text
+    root = ElementTree.fromstring(text)
+    for element in root.iter():
+        for key, name in element.attrib.items():
+            if key.startswith("file"):
+                element.set(key, str(folder / name))
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def _with_assets(root: ElementTree.Element, base: Path) -> dict[bytes, str]:
