@@ -387,6 +387,30 @@ def test_another_kind_of_file_is_told_from_its_first_bytes(tmp_path, kind, suffi
     assert str(path) in str(e.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.tsv", "NO_OF_FRAMES\t2\nNO_OF_CAMERAS\t8\n", "Qualisys: export it as C3D"),
+        ("a.csv", "Trajectories\n100\n,,Anna:LASI,,\n", "Nexus: export it as C3D"),
+        ("a.mot", "Coordinates\nversion=1\nnRows=2\n", "give the markers' TRC"),
+        ("a.sto", "Coordinates\nversion=1\nnRows=2\n", "give the markers' TRC"),
+        ("a.amc", "#!OML:ASF\n:FULLY-SPECIFIED\n", "with its ASF to BVH"),
+        ("a.asf", "# AST/ASF file\n:version 1.10\n", "with its AMC to BVH"),
+        ("a.usd", "PXR-USDC\0\0", "a USD file: export it"),
+        ("a.mat", "MATLAB 7.3 MAT-file, Platform", "positions, names and rate"),
+        ("a.qtm", b"\xd0\xcf\x11\xe0\xa1\xb1", "export it as C3D"),
+        ("a.json", '{"version": 1.3, "people": []}', "positions, names and rate"),
+        ("a.csv", "nose_x,nose_y,nose_z\n0,1,2\n", "positions.*, names and rate"),
+    ],
+)
+def test_recordings_that_are_not_read_say_what_to_do(tmp_path, name, content, told):
+    raw = content if isinstance(content, bytes) else content.encode()
+    (tmp_path / name).write_bytes(raw)
+    with pytest.raises(InputError, match=told) as e:
+        read_points(tmp_path / name)
+    assert "\n" not in str(e.value)
+
+
 def test_a_zip_and_a_file_of_another_kind_are_told(tmp_path):
     (tmp_path / "a.bvh").write_bytes(b"PK\x03\x04" + b"\0" * 30)
     with pytest.raises(InputError):

@@ -244,7 +244,8 @@ def read_points(
     reader = next(iter([*certain, *by_suffix]), None)
     if reader is None:
         kinds = ", ".join(s for s in SUFFIXES if s not in YAML)
-        raise InputError(f"a recording: {kinds}", path)
+        then = "of another format save positions, names and rate as .npz"
+        raise InputError(f"a recording: {kinds}; {then}", path)
     if reader in (arrays.read_array, arrays.read_pickled):
         given = arrays.Given(
             names=names, rate=rate, subject=subject, body_model=body_model, robot=robot
