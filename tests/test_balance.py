@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clamber.contact.contact import Contact
-from clamber.execution.balance import FADE, HIGH, MOST, SAG, Balance
+from clamber.execution.balance import FADE, HIGH, MOST, ON_GROUND, SAG, Balance
 from clamber.model.kinematics import Kinematics
 from clamber.model.se3 import quat_from_matrix
 from clamber.planning.records import Plan
@@ -149,15 +149,22 @@ def test_the_integral_goes_on_up_to_its_bound(demo_plan, kin, kneeling):
     assert sizes[-1] == pytest.approx(MOST, rel=0.1)
 
 
-def test_it_sets_in_between_two_margins(demo_plan, kin):
-    """Nothing above the one, all of it below the other, and no jump."""
-    q, feet = demo_plan.start.q, demo_plan.start.stance
+@pytest.mark.parametrize("kneels", [False, True])
+def test_it_sets_in_between_two_margins(demo_plan, kin, kneeling, kneels):
+    """Nothing above the one, all of it below the other, and no jump; later on feet."""
+    q, contacts = demo_plan.start.q, demo_plan.start.stance
+    high, fade = ON_GROUND
+    if kneels:
+        q, contacts = kneeling
+        high, fade = HIGH, FADE
+    q = at_margin(kin, q, contacts, high + 0.01)
     sizes = []
-    low = HIGH - FADE
-    for margin in (HIGH + 0.001, HIGH - 0.001, HIGH - 0.5 * FADE, low, low - 0.001):
-        sagged = at_margin(kin, q, feet, margin)
-        offset = answered(demo_plan, sagged, q, feet, ticks=30)
-        sizes.append(float(np.linalg.norm(shift_of(kin, q, offset, feet)[0])))
+    low = high - fade
+    for margin in (high + 0.001, high - 0.001, high - 0.5 * fade, low, low - 0.001):
+        sagged = at_margin(kin, q, contacts, margin)
+        offset = answered(demo_plan, sagged, q, contacts, ticks=30)
+        shift = shift_of(kin, q, offset, contacts)[0]
+        sizes.append(float(np.linalg.norm(shift)))
     assert sizes[0] == 0.0
     assert 0.0 < sizes[1] < 0.3 * sizes[2]
     assert 0.3 * sizes[4] < sizes[2] < 0.8 * sizes[4]

@@ -289,8 +289,6 @@ class Balance:
         self,
         model: Model,
         *,
-        high: float,
-        fade: float,
         sag: float,
         p: float,
         d: float,
@@ -302,8 +300,24 @@ class Balance:
     ) -> None:
         """Margins [m], gains, bounds and times [s] of the law."""
 
-    def hold(self, bodies: list[int], local: np.ndarray, sole: np.ndarray) -> None:
-        """Points (n, 3) of links bear, each `sole` (n, 3) farther in the world."""
+    def hold(
+        self,
+        bodies: list[int],
+        local: np.ndarray,
+        sole: np.ndarray,
+        *,
+        high: float,
+        fade: float,
+    ) -> None:
+        """Points (n, 3) of links bear, each `sole` (n, 3) farther in the world.
+
+        Args:
+            bodies: (n) their links.
+            local: (n, 3) where they are on them.
+            sole: (n, 3) of what bears, from there.
+            high: The margin at which feedback sets in [m].
+            fade: Within how much less it is whole [m].
+        """
 
     def update(self, q: np.ndarray, reference: np.ndarray) -> bool:
         """Whether to move by `shift` (2,); postures (nq,) as measured, as planned."""

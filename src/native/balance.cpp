@@ -21,7 +21,7 @@ namespace {
 class Balance {
 public:
     struct Law {
-        double high, fade, sag;   // [m] margins at which it sets in
+        double sag;               // [m] less than the planned margin is no danger
         double p, d, t, most;     // gain, [s] of rate and integral, [m] bound
         double smoothing, settled;  // [s] of the deviation, [m] that is nothing
         double period;            // [s]
@@ -36,6 +36,7 @@ public:
     // False where there is nothing to move; else `shift` is where to.
     bool feed_back(const Seen& now, const Seen& planned);
 
+    double high = 0.0, fade = 1.0;  // [m] margin at which it sets in, and within how much
     double shift[2] = {0.0, 0.0};
 
 private:
@@ -68,8 +69,8 @@ bool Balance::feed_back(const Seen& now, const Seen& planned) {
     c = n > 0 ? c / n : 1.0, s = n > 0 ? s / n : 0.0;
     const double e[2] = {c * now.com[0] - s * now.com[1] - planned.com[0],
                          s * now.com[0] + c * now.com[1] - planned.com[1]};
-    const double inside = std::min(law_.high, planned.margin - law_.sag) - now.margin;
-    const double w = std::clamp(inside / law_.fade, 0.0, 1.0);
+    const double inside = std::min(high, planned.margin - law_.sag) - now.margin;
+    const double w = std::clamp(inside / fade, 0.0, 1.0);
     double move[2];
     for (int a = 0; a < 2; ++a) {
         const double rate = (e[a] - deviation_[a]) / (law_.smoothing + law_.period);
@@ -96,7 +97,7 @@ struct BalanceOf {
     BalanceOf(const std::shared_ptr<const Model>& model, const Balance::Law& law)
         : model(model), kin(*model), balance(law) {}
 
-    void hold(std::vector<int> on, In local, In sole) {
+    void hold(std::vector<int> on, In local, In sole, double high, double fade) {
         want(local.size() == 3 * on.size() && sole.size() == local.size(),
              "a link, a place on it and one from there for each point");
         bodies = std::move(on);
@@ -106,6 +107,7 @@ struct BalanceOf {
             points.emplace_back(read3(local.data() + 3 * i), read3(sole.data() + 3 * i));
         }
         places.resize(points.size());
+        balance.high = high, balance.fade = fade;
     }
     void look(In q, Balance::Seen& out) {
         want(q.size() == size_t(model->nq), "a posture");
@@ -139,14 +141,15 @@ struct BalanceOf {
 void bind_balance(nb::module_& m) {
     nb::class_<BalanceOf>(m, "Balance")
         .def("__init__", [](BalanceOf* self, const std::shared_ptr<const Model>& model,
-                            double high, double fade, double sag, double p, double d, double t,
-                            double most, double smoothing, double settled, double period) {
-            new (self) BalanceOf(model, {high, fade, sag, p, d, t, most, smoothing, settled,
+                            double sag, double p, double d, double t, double most,
+                            double smoothing, double settled, double period) {
+            new (self) BalanceOf(model, {sag, p, d, t, most, smoothing, settled,
                                          period});
-        }, nb::arg("model"), nb::kw_only(), nb::arg("high"), nb::arg("fade"), nb::arg("sag"),
+        }, nb::arg("model"), nb::kw_only(), nb::arg("sag"),
            nb::arg("p"), nb::arg("d"), nb::arg("t"), nb::arg("most"), nb::arg("smoothing"),
            nb::arg("settled"), nb::arg("period"))
-        .def("hold", &BalanceOf::hold, nb::arg("bodies"), nb::arg("local"), nb::arg("sole"))
+        .def("hold", &BalanceOf::hold, nb::arg("bodies"), nb::arg("local"), nb::arg("sole"),
+             nb::kw_only(), nb::arg("high"), nb::arg("fade"))
         .def("update", &BalanceOf::update, nb::arg("q"), nb::arg("reference"))
         .def_prop_ro("shift", [](BalanceOf& self) {
             return nb::cast(new_array(self.balance.shift, {2}));

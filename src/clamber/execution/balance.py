@@ -4,7 +4,8 @@ A plan's postures balance, but a compliant robot sags by some millimetres, and w
 support is a narrow triangle that is all there is. Once the margin of the measured
 centre of mass falls below `HIGH`, and by `SAG` below the planned one, its deviation e
 from the plan, seen from the contacts, is fed back (with all its weight, w = 1, from
-`FADE` less on):
+`FADE` less on; with feet on the ground alone both are `ON_GROUND`: a robot that leans
+towards what it reaches for, brought back over weak ankles, falls backward):
 
     s = -w (P e + D de/dt) - integral(w e / T dt),    |s| <= MOST,
 
@@ -24,10 +25,12 @@ from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.model.core import core_of
 from clamber.model.kinematics import Kinematics
+from clamber.model.scene import GROUND
 from clamber.model.world import World
 from clamber.step.tasks import contact_rows
 
 HIGH, FADE = 0.045, 0.02  # [m] margin at which feedback sets in, and within how much
+ON_GROUND = 0.022, 0.008  # ... where nothing but feet on the ground bears
 SAG = 0.003  # [m] less than the planned margin is no danger
 P, D, T = 0.5, 0.1, 1.0  # gain; [s] of the rate; [s] of the integral
 MOST = 0.03  # [m]
@@ -49,8 +52,6 @@ class Balance:
         self._kin = Kinematics(world)
         self._core = _core.Balance(
             core_of(world),
-            high=HIGH * world.length_scale,
-            fade=FADE * world.length_scale,
             most=MOST * world.length_scale,
             **{"sag": SAG, "p": P, "d": D, "t": T},
             **{"smoothing": RATE_SMOOTHING, "settled": SETTLED},
@@ -85,13 +86,24 @@ class Balance:
     def _hold(self, contacts: Sequence[Contact]) -> None:
         """These contacts are loaded from here on."""
         world, bodies, local, sole = self._kin.world, [], [], []
+        on_ground = all(
+            c.support == GROUND and world.surface(c.surface, c.edge).radius == 0.0
+            for c in contacts
+        )
+        high, fade = ON_GROUND if on_ground else (HIGH, FADE)
         for c in contacts:
             s = world.surface(c.surface, c.edge)
             bodies += [s.body] * len(s.corners)
             local.append(s.corners)
             down = -s.radius * world.supports[c.support].normal
             sole.append(np.tile(down, (len(s.corners), 1)))
-        self._core.hold(bodies, np.concatenate(local), np.concatenate(sole))
+        self._core.hold(
+            bodies,
+            np.concatenate(local),
+            np.concatenate(sole),
+            high=high * world.length_scale,
+            fade=fade * world.length_scale,
+        )
         self._contacts = contacts
 
     def _moved(self, reference: np.ndarray) -> np.ndarray:
