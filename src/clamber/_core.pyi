@@ -104,7 +104,7 @@ def com_room(
     mass: float,
     torque: _Torque,
 ) -> float:
-    """How far the centre of mass may lie elsewhere [m], in the worst direction.
+    """Margin of the centre of mass [m], in the worst direction.
 
     Negative: how far it has to, -1 where no place would do.
     """
@@ -146,7 +146,7 @@ class JointServo:
         limit: list[float],
         dt: float,
     ) -> None:
-        """Of na joints; `limit` of the integral [rad s], `dt` of a step [s]."""
+        """Gains of na joints; `limit` of the integral [rad s], time step `dt` [s]."""
 
     def command(
         self,
@@ -278,7 +278,7 @@ class ContactForces:
         """The index of each geom's surface, or `SCENE`, or `OTHER`."""
 
     def update(self, data: object) -> None:
-        """Those of an `MjData` after a step: `surface` (nS, 3) is their sum [N]."""
+        """Reads forces of an `MjData` after a step; `surface` (nS, 3): sums [N]."""
 
 class Balance:
     """Where to move a centre of mass that is near the border of its support."""
@@ -354,7 +354,7 @@ class Loop:
         """All that is due before the next `mj_step`; False where there is none."""
 
     def recorded(self) -> dict[str, np.ndarray]:
-        """What was recorded, by the names of a rollout; once."""
+        """Recorded arrays, by the names of a rollout; may be called once."""
 
 def load_is_missing(load: np.ndarray, weight: float, share: float) -> bool:
     """Whether forces (nS, 3) are less than the weight by a share of it."""

@@ -1,4 +1,4 @@
-"""What a person or a program sees of a command: progress, tables, one JSON object.
+"""Output of a command: progress, tables, or one JSON object.
 
 Progress goes to stderr, results to stdout. A table is made of the same record that
 `--json` prints, so that both say the same.
@@ -97,7 +97,7 @@ class Interrupted(KeyboardInterrupt):
         self.folder = folder
 
     def __str__(self) -> str:
-        """What there is."""
+        """The folder and its files, in a sentence."""
         files = self.folder.glob("*") if self.folder.is_dir() else ()
         names = sorted(f.name for f in files if not f.name.startswith("."))
         if not names:
@@ -310,7 +310,7 @@ def policy_tables(policy: clamber.GeneralPolicy, name: str) -> list[Table]:
 
 
 def _strained(rollout: clamber.Rollout) -> str:
-    """Which joint may be too weak; empty where none was at its limit."""
+    """A sentence on the joint at its effort limit; empty if none was."""
     from clamber.execution.verdict import strained_joint
 
     found = strained_joint(rollout)

@@ -1,4 +1,4 @@
-"""How far a command has come, on the terminal: a bar, or lines for a log."""
+"""Progress of a command on the terminal: a bar, or lines for a log."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class RenderCommand:
     transparent: Switch = False
     """Without ground or sky, on a transparent background; with --frame."""
     size: Annotated[str | None, shown("1080p|WxH", "frames 1080p, videos 720p")] = None
-    """Of the video, the frame, or each picture of the sheet."""
+    """Size of the video, the frame, or each picture of the sheet."""
     out: Annotated[Path | None, shown("FILE", "in RUN")] = None
     """The file."""
     output: Printed
@@ -208,7 +208,7 @@ class ViewCommand:
             page.close()
 
     def _say(self, page: Any) -> None:
-        """Where the page is, and what it cannot show."""
+        """Prints the page's address, and what it cannot show."""
         self.output.warn(*page.missing)
         lines = [f"the page is at {page.url} (Ctrl-C ends it)"]
         if page.port != page.wanted:

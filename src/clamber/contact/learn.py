@@ -167,7 +167,7 @@ class _Action:
 
     @property
     def surface(self) -> str:
-        """That makes the contact."""
+        """Surface that makes the contact."""
         return self.makes.surface
 
 
@@ -253,7 +253,7 @@ def find_cycles(names: Sequence[str], *, first: int = 0) -> tuple[int, int, int]
 
 
 def _repeats(names: Sequence[str], start: int, n: int) -> int:
-    """How often in a row the set of the first `n` names comes again, itself counted."""
+    """Number of successive occurrences of the first `n` names as a set."""
     cycle, k = set(names[start : start + n]), 1
     if len(cycle) < n:
         return 0
@@ -340,7 +340,7 @@ def contract_policies(demos: Sequence[DemoPolicy]) -> GeneralPolicy:
 
 
 def _fit(cycles: list[_Cycle], leader: list[_Cycle]) -> list[int] | None:
-    """Which of the leader's cycles each one is, in the same order; None where none."""
+    """Index of the leader's matching cycle for each, in order; None if one has none."""
     out: list[int] = []
     for cycle in cycles:
         first = out[-1] + 1 if out else 0

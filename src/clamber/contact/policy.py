@@ -1,4 +1,4 @@
-"""What a demonstration does in general: cycles of contacts, and the pelvis's pose.
+"""Policy of a demonstration: cycles of contacts, and the pelvis's pose.
 
 The demo policy is a table of states and actions [thesis 5.1]. A state is a `Stance`:
 contacts and the pelvis's pose, in a region (`G`, `O`, `M`). An action is the surface

@@ -81,7 +81,7 @@ def _obstacles(
 
 
 def _near_edge(supports: tuple[Support, ...], start: np.ndarray) -> Edge:
-    """Of those of some supports, the one that is nearest to a place (2,)."""
+    """The edge nearest to a point (2,), of all edges of some supports."""
     edges = [s.edge_towards(start) for s in supports]
     return min(edges, key=lambda e: float(np.linalg.norm(e.point[:2] - start[:2])))
 

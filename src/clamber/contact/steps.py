@@ -16,7 +16,7 @@ NOT_SHOWN = Stance(contacts=())  # of a step that no demonstration shows
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepTolerances:
-    """How near to where it was a contact has not moved [m], by who asks.
+    """Distances below which a contact counts as unmoved [m], by purpose.
 
     Larger: fewer steps; too large: steps that matter are missed. Too small: a shuffle
     counts as a step.

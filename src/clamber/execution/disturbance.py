@@ -1,4 +1,4 @@
-"""How the true world differs from the planned one, and how well it is sensed."""
+"""Differences of the simulated world from the planned one, and sensor noise."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """What the planner does not know.
+    """Disturbances that the planner does not know.
 
     Attributes:
         height: Boxes are higher than planned by this [m].

@@ -37,7 +37,7 @@ YIELDS = 0.005  # [m] a contact that bears lies so far beside where its joints a
 
 
 class Estimate:
-    """What is known of one robot in a world that is believed in.
+    """State estimate of a robot: base, joints, contact forces, supports.
 
     Attributes:
         world: As it is believed to be; kin: a workspace of it.
@@ -83,7 +83,7 @@ class Estimate:
         self.filter.watch(*self._along(contacts), force or self.touch)
 
     def row(self, surface: str) -> int:
-        """Of a surface in the forces."""
+        """Row of a surface in the forces."""
         return self.surfaces.index(surface)
 
     def force(self, c: Contact) -> float:
@@ -111,7 +111,7 @@ class Estimate:
         return self.kin.contact_point(c.surface, n, c.edge)
 
     def deviation(self, c: Contact) -> tuple[float, float]:
-        """How far a contact is from its plan, along the normal and sideways [m]."""
+        """Deviation of a contact from its plan: along the normal and tangential [m]."""
         n = self.world.supports[c.support].normal
         off = self.point(c) - c.position - self.kin.roll(c.surface, n, c.link)
         up = float(off @ n)

@@ -1,4 +1,4 @@
-"""What happened during execution: records, each of which says itself to people."""
+"""Events of execution: records with a readable `str`."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ class Executive:
         return self.core.command(measured.q, measured.force, self)
 
     def decide(self, look: bool) -> None:
-        """What to follow next; `look` once every `LOOK_STRIDE` steps."""
+        """Chooses what to follow next; `look` is true every `LOOK_STRIDE` steps."""
         if look:
             self.watch.look(self.estimate.load, self._in_use)
             back = self._has_slipped(self._bearing)
@@ -191,12 +191,12 @@ class Executive:
 
     @property
     def followed(self) -> Trajectory | None:
-        """What was followed, where that is not the plan; velocities of joints only."""
+        """Trajectory that was followed, if not the plan; velocities of joints only."""
         return self._ref.followed(self.core.commanded, np.array(self._reached))
 
     @property
     def stance(self) -> tuple[Contact, ...]:
-        """Of the last keyframe that was reached, as planned."""
+        """Contacts of the last keyframe reached, as planned."""
         return self._at_hand.stance
 
     # What it does.
@@ -289,7 +289,7 @@ class Executive:
         return True
 
     def _go_ahead(self) -> Actions:
-        """What was planned ahead of a policy has been done: the next steps of it."""
+        """Plans the policy's next steps once those planned ahead are done."""
         key = self._at_hand.keyframes[-1]
         scene, clearance = self.estimate.world.scene, self.watch.clearance
         found = rest_of(self._plan, scene, key, 0.0, clearance, self._report)
@@ -662,12 +662,12 @@ class Executive:
 
 
 def _places(stance: Sequence[Contact]) -> set[tuple[str, str]]:
-    """Which surface is on which support."""
+    """Pairs of surface and support."""
     return {(c.surface, c.support) for c in stance}
 
 
 def _resting(estimate: Estimate, stance: Sequence[Contact]) -> Iterable[str]:
-    """Which contacts the robot rests on: those of the stance, as they are."""
+    """Contacts that bear: those of the stance, and others of its limbs where loaded."""
     for c in stance:
         for surface in estimate.world.robot.limb_of(c.surface).surfaces:
             other = replace(c, surface=surface)

@@ -70,7 +70,7 @@ class OpenLoop:
 def follower(
     world: World, filter_: _core.Filter, ref: Reference, ankles: _core.SelfPositioning
 ) -> _core.Follower:
-    """What follows a reference on the servos of a world."""
+    """Follower of a reference by the joint servos of a world."""
     return _core.Follower(
         filter_,
         ref.track,

@@ -61,12 +61,12 @@ class AtHand:
 
     @property
     def stance(self) -> tuple[Contact, ...]:
-        """Of the last keyframe that was reached, as planned."""
+        """Contacts of the last keyframe reached, as planned."""
         return self.keyframes[self.change].stance
 
     @property
     def next_stance(self) -> tuple[Contact, ...]:
-        """Of the keyframe that comes next."""
+        """Contacts of the next keyframe."""
         return self.keyframes[self.change + 1].stance
 
     @property
@@ -75,14 +75,14 @@ class AtHand:
         return None if self.is_through else self.spans[self.change].makes
 
     def near_contacts(self) -> dict[str, Contact]:
-        """Of the keyframes before and after, by surface."""
+        """Contacts of the last and the next keyframe, by surface."""
         near = self.keyframes[self.change : self.change + 2]
         return {c.surface: c for key in near for c in key.stance}
 
     def closed_contacts(
         self, closed: np.ndarray, surfaces: tuple[str, ...]
     ) -> list[Contact]:
-        """Those whose surfaces, of nS in order, are in contact: (nS,) bool."""
+        """Contacts that are closed, by their surfaces of nS in order: (nS,) bool."""
         row = surfaces.index
         return [c for s, c in self.near_contacts().items() if closed[row(s)]]
 
@@ -95,7 +95,7 @@ def rest_of(
     clearance: ExtraClearance,
     report: Progress,
 ) -> Plan:
-    """What is left to do of a plan, in the scene as it is believed to be.
+    """The rest of a plan, in the scene as it is estimated.
 
     Where contacts are so far `off` that the plan at hand will not do, other ones than
     the demonstrated may. Where nothing robust is left to do, it need not be.
@@ -129,7 +129,7 @@ def rest_of(
 
 
 def nearest_keyframe(plan: Plan, made: Change, *, begin: int) -> int | None:
-    """Which keyframe of a plan a contact change leads to that is of another plan.
+    """Keyframe of a plan to which a contact change of another plan leads.
 
     Args:
         plan: Its keyframes are looked at, but for the start.

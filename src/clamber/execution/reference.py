@@ -37,7 +37,7 @@ Actions = Generator[None, None, None]
 
 
 class Reference:
-    """What the joints shall do now, and what they were to do so far.
+    """Reference of the joints: now, and as commanded so far.
 
     Attributes:
         trajectory: That is followed.
@@ -206,7 +206,7 @@ class Reference:
         self._offset = offset, self.torque - t.tau[i], i + 1
 
     def followed(self, q: np.ndarray, keyframes: np.ndarray) -> Trajectory | None:
-        """What was commanded, where that is not the first trajectory.
+        """Trajectory as commanded, if it is not the first one.
 
         Velocities are those of joints only.
 

@@ -1,4 +1,4 @@
-"""What a robot knows of itself: late, and with noise.
+"""Sensors with noise and delay.
 
 Sensed are the joint encoders, the pose of the base (as an estimator gives it from an
 inertial unit and the kinematics) and the contact force on each surface (from force
@@ -87,7 +87,7 @@ class Sensors:
         self.core.draw(offset, tilt, gain, pull)
 
     def read(self, data: mujoco.MjData) -> Measurement:
-        """What is known at this physics step; call once for each."""
+        """Measurement at this physics step; call once for each."""
         if self._k % BLOCK == 0:
             self.draw()
         self._k += 1
@@ -96,7 +96,7 @@ class Sensors:
 
 
 def contact_forces(world: World) -> _core.ContactForces:
-    """Of the scene on the robot, by its surfaces in order."""
+    """Contact forces of the scene on the robot, by its surfaces in order."""
     m = world.model
     rows = np.where(m.body_weldid[m.geom_bodyid] == 0, _core.SCENE, _core.OTHER)
     for i, surface in enumerate(world.surfaces.values()):

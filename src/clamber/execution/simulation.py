@@ -40,7 +40,7 @@ DEFAULT_CONTROLLER: ControlMode = "mixed"
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Rollout(Viewed):
-    """What physics did, as measured.
+    """Result of a simulation, as measured.
 
     Commands are multiples of a microradian; states and forces have single precision.
     Contacts of the robot with the scene are listed after steps 0, stride, 2 stride ...

@@ -36,7 +36,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class UnintendedContact:
-    """What touches what.
+    """An unintended contact: the link, and what it touches.
 
     Attributes:
         geom: Of the robot, in the model.
@@ -55,7 +55,7 @@ def load_is_missing(load: np.ndarray, weight: float) -> bool:
 
 
 def hit_sideways(load: np.ndarray, least: float = SIDEWAYS) -> list[int]:
-    """Which surfaces are pushed sideways more than upwards, and than `least` [N].
+    """Surfaces loaded more tangentially than normally, and by more than `least` [N].
 
     No contact on a level support is loaded like that, at a friction of up to 1.
 
@@ -222,7 +222,7 @@ class Watch:
         return [s for s in hit if s not in used]
 
     def take(self) -> UnintendedContact:
-        """What was found: from now on with more clearance."""
+        """Returns the contact found; planning keeps more clearance from then on."""
         at = self.found
         assert at is not None
         self.found, key = None, (at.geom, at.support)

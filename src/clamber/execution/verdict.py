@@ -45,7 +45,7 @@ EVERY = 5  # recorded states between two looks for self-penetration
 
 
 class Figure(StrEnum):
-    """What a verdict rests on; its value is the label with the unit."""
+    """Criteria of a verdict; the value is the label with its unit."""
 
     UPRIGHT = "did not fall"
     WENT_ON = "did not stop on the way"

@@ -78,7 +78,7 @@ def _fits(kind: Any, value: object) -> bool:
 
 
 def _refusal(function: str, name: str, kinds: list[Any], value: object) -> InputError:
-    """What to raise of an argument that fits none of its kinds."""
+    """The error for an argument that has none of the accepted types."""
     of = [k for k in kinds if typing.get_origin(k) is Literal]
     choices = [c for k in of for c in typing.get_args(k)]
     if choices and isinstance(value, str):

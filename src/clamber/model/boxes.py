@@ -1,4 +1,4 @@
-"""What is drawn: files of other programs -> `Box` records, and shapes of other kinds.
+"""Scene files of other programs -> `Box` records, and shapes of other kinds.
 
 An OBJ holds boxes by their corners; an MJCF, URDF or SDF holds fixed shapes. Meshes
 with the corners of a box are boxes, other shapes are triangles.
@@ -123,7 +123,7 @@ def read_obj(
 
 
 def _indices(words: list[str], count: int, line: int, path: Path) -> list[int]:
-    """Of the vertices of a face, from 0; those below 0 count from the end."""
+    """Vertex indices of a face, from 0; negative ones count from the end."""
     try:
         found = [int(w.split("/")[0]) for w in words]
     except ValueError:
@@ -139,7 +139,7 @@ def _pieces(
     names: Sequence[str | None],
     faces: Sequence[tuple[str | None, list[int]]],
 ) -> list[tuple[str | None, list[int]]]:
-    """Which vertices (N, 3) make a solid each, and the object's name."""
+    """Vertex indices of each solid among vertices (N, 3), and its object's name."""
     by_eight: list[tuple[str | None, list[int]]] = []
     for name, several in itertools.groupby(range(len(v)), key=lambda i: names[i]):
         rows = list(several)
@@ -239,7 +239,7 @@ def _fit_box(name: str, v: np.ndarray, path: Path) -> Box:
 
 
 def _extent(v: np.ndarray, R: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """How far vertices are from a box along the axes `R`, its low and high corner."""
+    """Misfit of vertices to a box along the axes `R`, its low and high corner [m]."""
     local = v @ R
     low, high = local.min(axis=0), local.max(axis=0)
     off = np.minimum(np.abs(local - low), np.abs(local - high)).max()
@@ -280,7 +280,7 @@ def _tilted(v: np.ndarray) -> np.ndarray | None:
 def read_described(
     path: Path, friction: float = DEFAULT_FRICTION
 ) -> tuple[Drawn, float | None]:
-    """What of an MJCF or URDF is fixed to the world, and its plane's friction.
+    """Fixed geometry of an MJCF or URDF, and the friction of its ground plane.
 
     Args:
         path: The file.

@@ -276,7 +276,7 @@ def _leave_out_looks(spec: mujoco.MjSpec, path: Path, notes: list[str]) -> None:
 
 
 def _mesh_path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh, path: Path) -> Path | None:
-    """Where the file of a mesh is, as MuJoCo looks for it; None where it is not."""
+    """Path of a mesh file, searched for as MuJoCo does; None if it is missing."""
     name = Path(mesh.file)
     places = [path.parent / spec.meshdir / name, path.parent / spec.meshdir / name.name]
     return next((p for p in [*places, path.parent / name] if p.is_file()), None)
@@ -405,7 +405,7 @@ def _keep_all(root: ElementTree.Element) -> None:
 
 
 def _places(name: str, path: Path) -> Iterator[Path]:
-    """Where a mesh of a URDF may be, the likeliest first."""
+    """Candidate paths of a URDF's mesh, the likeliest first."""
     scheme = next((x for x in PACKAGES if name.startswith(x)), None)
     if scheme is None:
         yield path.parent / name.removeprefix("file://")
@@ -431,7 +431,7 @@ def _places(name: str, path: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class MeshFile:
-    """What a file holds, in its own axes.
+    """Vertices and faces of a mesh file, in its own axes.
 
     Attributes:
         vertices: (N, 3) [m].
@@ -470,7 +470,7 @@ def read_mesh(path: Path) -> MeshFile:
 
 
 def read_shapes(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a file of meshes holds, as it is: some of it may be no numbers.
+    """Raw contents of a mesh file, which may include NaN.
 
     Returns:
         Corners (F, 3, 3) of triangles and points (N, 3) that are of none, in metres or

@@ -1,4 +1,4 @@
-"""What drives the joints of a proposal: effort limits, gains, armature, damping.
+"""Joint drives of a proposal: effort limits, gains, armature, damping.
 
 Limits are those of the description; gains are the built-in robot's by weight times
 height, for servos that are as quick.
@@ -105,7 +105,7 @@ def _two_digits(x: float) -> float:
 
 
 def braked(tree: Tree, found: Anatomy) -> list[str]:
-    """What is said where joints of the description are braked more than joints are."""
+    """Notes on joints whose damping, dry friction or armature is capped."""
     model, dofs = tree.model, tree.model.jnt_dofadr[list(found.moving)]
     brakes = (
         (model.dof_damping[dofs], MAX_DAMPING, "N m s/rad of damping"),

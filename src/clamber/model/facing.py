@@ -174,7 +174,7 @@ def _joint_name(model: mujoco.MjModel, joint: int) -> str:
 
 
 def _longer_ahead(along: np.ndarray) -> float:
-    """How much farther ahead of the ankle than behind a sole is, of its length."""
+    """Reach of a sole ahead of the ankle less that behind, per its length."""
     if len(along) == 0 or np.ptp(along) < 1e-9:
         return 0.0
     return float((along.max() + along.min()) / np.ptp(along))
@@ -189,7 +189,7 @@ def _motion(tree: Tree, chain: Chain) -> np.ndarray:
 
 
 def _room(tree: Tree, chain: Chain) -> tuple[float, float]:
-    """How far knee or elbow may turn from straight: negative and positive [rad]."""
+    """Range of a knee or elbow from straight: negative and positive side [rad]."""
     data, j = tree.data, chain.elbow
     anchor, axis = data.xanchor[j], data.xaxis[j]
     out = anchor - data.xanchor[chain.joints[min(1, chain.bend)]]

@@ -127,7 +127,7 @@ def find_limbs(tree: Tree) -> Anatomy:
 
 
 def _found(tree: Tree, pairs: list[tuple[int, int]]) -> str:
-    """Which limbs there are, and which joints are left that could make others."""
+    """A sentence with the limbs found, and the joints left over."""
     model = tree.model
     limbs = [b for p in pairs for b in p]
     rest = [
@@ -225,7 +225,7 @@ def _without_toes(tree: Tree, way: list[int], knee: int) -> list[int]:
 
 
 def _bending(tree: Tree, joints: list[int], end: int) -> tuple[int, float]:
-    """Which hinge is the knee or elbow, and the direction in which it flexes.
+    """The hinge that is the knee or elbow, and the sign of its flexion.
 
     That with the largest product of levers: distance of its axis from the limb's second
     joint, the middle of shoulder or hip, times that from its tip. A twist has none on

@@ -174,7 +174,7 @@ def _merged(polygon: shapely.Polygon, fill: float) -> list[np.ndarray]:
 
 
 def _hull(points: np.ndarray, ids: list[int]) -> list[int]:
-    """Of some points (n, 2), those on their convex hull, counter-clockwise."""
+    """Indices of the points (n, 2) on their convex hull, counter-clockwise."""
     order = sorted(set(ids), key=lambda i: (points[i, 0], points[i, 1]))
     out: list[int] = []
     for half in (order, order[::-1]):
@@ -294,7 +294,7 @@ def _solid(
 
 
 def _depth_of(corners: np.ndarray, shape: BaseGeometry) -> float:
-    """How deep a plane through corners (m, 3), in P, is at the least in a shape [m]."""
+    """Least depth within a shape of a plane through corners (m, 3), in P [m]."""
     at = shapely.get_coordinates(shape)
     if len(at) == 0:
         return math.inf
@@ -362,7 +362,7 @@ def _shrunk(shape: BaseGeometry, ragged: float) -> BaseGeometry:
 
 
 def _above_ground(region: Region) -> BaseGeometry:
-    """What of a region is over the plane z = 0, by more than would be measured."""
+    """Part of a region that is above the ground z = 0, by more than `EVEN` / 2."""
     n = region.rotation[2]  # z of a point (x, y, 0) of P is origin + n . (x, y, 0)
     size, tilt = 100.0, float(np.hypot(n[0], n[1]))
     z = region.world(shapely.get_coordinates(region.shape))[:, 2]
@@ -377,7 +377,7 @@ def _above_ground(region: Region) -> BaseGeometry:
 
 
 def _over(points: np.ndarray) -> BaseGeometry | None:
-    """What a convex piece (K, 3), in P, covers between `EVEN` and `COVERED` over it."""
+    """Outline of a convex piece (K, 3), in P, at heights from `EVEN` to `COVERED`."""
     z = points[:, 2]
     if z.max() <= EVEN or z.min() >= COVERED:
         return None

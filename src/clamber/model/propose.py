@@ -422,7 +422,7 @@ def nominal_posture(
 def _over_ankles(
     tree: Tree, data: mujoco.MjData, found: Anatomy, effort: Mapping[str, float]
 ) -> tuple[float, float]:
-    """How far the CoM may be behind and ahead of the ankles at half of their effort.
+    """CoM range behind and ahead of the ankles at half of their effort limits [m].
 
     [m] along x; each leg bears half of the weight.
     """

@@ -1,4 +1,4 @@
-"""What records that hold arrays share: a short `repr`, arrays that stay as they are."""
+"""Base of records with arrays: a short `repr`, read-only arrays."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def short_repr(self: Any) -> str:
 
 
 def _brief(value: object) -> str:
-    """What can be read at a glance, or what kind of thing it is and how many."""
+    """Short form of a value: itself if it is short, else its type and length."""
     if isinstance(value, np.ndarray):
         if value.ndim == 1 and len(value) <= 4 and value.dtype.kind in "bif":
             return f"[{', '.join(f'{x:.4g}' for x in value.tolist())}]"

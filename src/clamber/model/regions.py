@@ -155,7 +155,7 @@ def neighbours(
 def _around(
     vertices: np.ndarray, faces: np.ndarray, half: np.ndarray, along: np.ndarray
 ) -> list[tuple[int, int]]:
-    """Which half-edges (n,) of one edge are neighbours, by angles about it.
+    """Pairs of neighbours among half-edges (n,) of one edge, by angle about it.
 
     From a face that has the edge `along` it, the solid is on the side to which one
     turns with the clock, as far as the next face that has it the other way round.
@@ -194,7 +194,7 @@ def face_normals(
 def _evenness(
     vertices: np.ndarray, faces: np.ndarray, pairs: np.ndarray, edge: np.ndarray
 ) -> tuple[float, float]:
-    """How far triangles may be from their plane [m], and turned from it [rad].
+    """Tolerances of plane fitting: distance [m] and angle [rad], from the mesh's noise.
 
     In a plane with noise sigma, the far vertex of a neighbour is off a triangle's plane
     by about two sigma; at real edges by more, so that the lower quartile is looked at.
@@ -451,7 +451,7 @@ def _fitted(
 
 
 def _area_in(ends: np.ndarray, triangles: np.ndarray, ragged: float) -> BaseGeometry:
-    """What is inside border lines (n, 2, 2), straightened, small holes closed.
+    """Area inside border segments (n, 2, 2), straightened, small holes closed.
 
     Where lines cross, as the folds of a noisy border do, it is the cells between them
     that have a triangle (m, 3, 2) over them.
@@ -496,7 +496,7 @@ def _ring_area(ring: shapely.LinearRing) -> float:
 
 
 def polygons_in(shape: BaseGeometry) -> Iterator[shapely.Polygon]:
-    """What of it has an area."""
+    """Polygons of a shape, without its points and lines."""
     for g in shapely.get_parts(shape):
         if isinstance(g, shapely.Polygon):
             yield g

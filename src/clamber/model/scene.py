@@ -65,7 +65,7 @@ class Edge:
     __repr__ = short_repr
 
     def distance(self, p: np.ndarray) -> float:
-        """How far a world point (2,) or (3,) is behind the line [m]."""
+        """Signed distance of a world point (2,) or (3,) behind the line [m]."""
         return float((p[:2] - self.point[:2]) @ self.inward)
 
     @property
@@ -76,7 +76,7 @@ class Edge:
 
     @property
     def yaw(self) -> float:
-        """Of the edge frame in the world [rad]."""
+        """Yaw of the edge frame in the world [rad]."""
         return math.atan2(self.inward[1], self.inward[0])
 
 
@@ -370,7 +370,7 @@ class Mesh:
             raise ValueError(f"mesh {self.name}: a piece under each support")
 
     def piece_name(self, i: int) -> str:
-        """What the geom of a piece is called; no support is called so."""
+        """Name of a piece's geom; no support has it."""
         return f"{self.name}.{i}"
 
 
@@ -425,7 +425,7 @@ class Scene:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was mended in the files of meshes, a sentence each."""
+        """Repairs made to the mesh files, a sentence each."""
         return tuple(f"{m.name}: {note}" for m in self.meshes for note in m.notes)
 
     def owner(self, name: str) -> str:

@@ -431,7 +431,7 @@ def with_room(
 
 
 def _sizes(shape: Shape) -> int:
-    """How many of a shape's sizes are thickness: a capsule keeps its length."""
+    """Number of a shape's sizes that are thickness: a capsule keeps its length."""
     return 1 if shape.kind == mujoco.mjtGeom.mjGEOM_CAPSULE else len(shape.size)
 
 

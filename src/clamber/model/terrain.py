@@ -291,7 +291,7 @@ def load_scene(path: SceneLike) -> Scene:
 
 
 def _name_of(path: Path) -> str:
-    """What terrain is called that has the name of its file alone."""
+    """Name of a terrain, from that of its file."""
     plain = re.sub(r"[^A-Za-z0-9_]", "_", path.stem)
     return plain if re.match(NAME, plain) and plain != GROUND else "terrain"
 
@@ -307,7 +307,7 @@ def _mesh_of_shape(shape: Shape, path: Path) -> Mesh:
 def read_drawn(
     path: Path, friction: float, up: str | None = None
 ) -> tuple[Drawn, float | None]:
-    """What is drawn in a file, and the friction of the ground where it has one.
+    """Shapes in a scene file, and the ground's friction if it gives one.
 
     Args:
         path: The file.

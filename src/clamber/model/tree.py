@@ -113,7 +113,7 @@ class Tree:
         }
 
     def name(self, joint: int) -> str:
-        """Of a joint."""
+        """Name of a joint."""
         return self.model.joint(joint).name
 
     def joints(self, body: int) -> list[int]:

@@ -145,7 +145,7 @@ class World:
 
     @property
     def force_scale(self) -> float:
-        """Of the least forces that count as contacts: 1, less below `FULL_MASS`."""
+        """Factor on contact-force thresholds: 1, less for robots below `FULL_MASS`."""
         return min(1.0, self.mass / FULL_MASS)
 
     def landmark(self, name: str) -> tuple[int, np.ndarray]:
@@ -472,7 +472,7 @@ def _place(
     surfaces: Mapping[str, Surface],
     name: str,
 ) -> np.ndarray:
-    """Where a landmark is, (3,)."""
+    """Position of a landmark (3,) [m]."""
     body, point = _landmark(model, robot, surfaces, name)
     if not point.any():
         return data.xpos[body]
@@ -674,7 +674,7 @@ def _touching(
 
 
 def _rise(support: Support, piece: np.ndarray) -> float | None:
-    """How steeply a piece (K, 3) rises beside a support: the tangent; None: far off.
+    """Slope (tangent) at which a piece (K, 3) rises beside a support; None: far off.
 
     What rises over the support itself is as steep as can be, but for unevenness.
     """

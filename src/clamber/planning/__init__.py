@@ -1,1 +1,1 @@
-"""Which contacts, when: search, proposals, timing -> plan."""
+"""Contact planning and timing: search, proposals, trajectory -> plan."""

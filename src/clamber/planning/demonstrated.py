@@ -125,7 +125,7 @@ class _Line:
 
     @property
     def route(self) -> Route:
-        """How far it has come."""
+        """The plan so far."""
         return Route(start=self.start, changes=self.changes)
 
     def look(self, search: Search) -> _Line:
@@ -230,7 +230,7 @@ def _placed(step: Step, contact: Contact) -> Step:
 def repairs(
     ik: IK, route: Route, step: Step, *, margin: float | None = None
 ) -> Iterator[tuple[dict[int, Contact], Seeds]]:
-    """Which earlier changes should have made their contacts elsewhere for `step`.
+    """Earlier contacts, by their change, moved so that `step` becomes feasible.
 
     Looks at one contact after the other, the last one first, and then at all at once.
 

@@ -226,7 +226,7 @@ def _geometry_faults(world: World) -> list[str]:
 
 @checks_types
 def check_scene(scene: SceneLike) -> dict[str, str]:
-    """What is wrong with each support, by name; those without a fault are left out.
+    """Faults of supports, by name; those without one are left out.
 
     A top steeper than its friction angle bears no load, one below the ground is not
     there, one inside another box cannot be stood on, and none may be where the robot

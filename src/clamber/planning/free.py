@@ -1,4 +1,4 @@
-"""Which contacts, where the demonstrated ones do not lead there: a best-first search.
+"""Best-first search for contacts where the demonstrated ones do not reach the goal.
 
 A state is a stance with its posture, and the paths that lead to it; an action moves one
 limb to a contact: a surface of it, on a support, at a place. An action costs
@@ -99,7 +99,7 @@ def search_contacts(
 
 
 class _Free:
-    """What the entries of one search share."""
+    """State shared by the entries of one search."""
 
     def __init__(self, search: Search, guidance: _Guidance, start: Route) -> None:
         self.search, self.guidance, self._start = search, guidance, start
@@ -168,7 +168,7 @@ class _Action:
         return search.change("search", self.route.end, self.step)
 
     def after(self, found: Change | Failure) -> list[_Action]:
-        """What may be done after the step, where it is possible."""
+        """Actions that may follow a feasible step."""
         free = self.free
         free.often[self.kind] += 1
         if isinstance(found, Failure):
@@ -220,7 +220,7 @@ def sequence_of(world: World, route: Route) -> ContactSequence:
 
 
 class _Guidance:
-    """What a demonstration says of where to go, and by which actions."""
+    """Goal supports and action frequencies of a demonstration."""
 
     def __init__(self, world: World, sequence: ContactSequence, counts: Counts) -> None:
         self._world, self._sequence, self._counts = world, sequence, counts
@@ -268,7 +268,7 @@ class _Guidance:
         return near or not self._leads_back
 
     def left(self, stance: Sequence[Contact]) -> float:
-        """What it will cost to get the limbs to the supports that they end on.
+        """Cost-to-go: of bringing the limbs to the supports on which they end.
 
         To stand, a leg must be on its foot, and then the arms must let go: until both
         feet are up they are help, and cost nothing.
@@ -339,7 +339,7 @@ class _Guidance:
         return -math.log((count + UNSEEN) / (total + UNSEEN * len(names)))
 
     def _contacts(self, surface: str, support: str, root: np.ndarray) -> list[Contact]:
-        """Where a surface may be put: as demonstrated, or below what it supports."""
+        """Candidate contacts of a surface: demonstrated, or below its mass."""
         below = Contact(
             surface=surface,
             support=support,

@@ -1,4 +1,4 @@
-"""What a gait proposes, contacts to be made or steps to climb, and what came of it."""
+"""Proposals of a gait, contacts to be made or stairs to climb, and their results."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Outcome:
 
     @property
     def stance(self) -> tuple[Contact, ...]:
-        """Of the keyframe."""
+        """Contacts of the keyframe."""
         return self.key.stance
 
 

@@ -1,4 +1,4 @@
-"""What planning is asked for and what it finds."""
+"""Options and results of planning."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Attempt:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:
-    """What a proposer came to.
+    """Outcome of one proposer.
 
     Attributes:
         proposer: As of `Attempt`.
@@ -129,7 +129,7 @@ class Tried:
 
 
 def summary(attempts: Iterable[Attempt]) -> tuple[Tried, ...]:
-    """What each proposer came to, in the order in which they were asked."""
+    """Outcome of each proposer, in the order in which they were asked."""
     by: dict[str, list[Attempt]] = {}
     for attempt in attempts:
         by.setdefault(attempt.proposer, []).append(attempt)
@@ -185,7 +185,7 @@ class State:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Route:
-    """What a search found, as far as it goes.
+    """A contact sequence found by a search, complete or not.
 
     Attributes:
         start: The keyframe that it begins from.

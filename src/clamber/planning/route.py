@@ -62,7 +62,7 @@ class Platform:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Frame:
-    """Where the body is over its contacts: x, y [m] and yaw [rad]."""
+    """Planar pose of the body over its contacts: x, y [m] and yaw [rad]."""
 
     xy: np.ndarray
     yaw: float
@@ -191,7 +191,7 @@ def crossing(
 
 
 def _gate(top: Support, start: np.ndarray, goal: np.ndarray, share: float) -> Edge:
-    """Where the line from start to goal enters a top at that share, off its corners."""
+    """Edge where the line from start to goal enters a top, away from its corners."""
     corners, (A, b) = top.vertices[:, :2], _sides(top)
     p = start + share * (goal - start)
     facing = A @ (goal - start) < 0

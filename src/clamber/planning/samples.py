@@ -202,7 +202,7 @@ class Run:
 
     @property
     def samples(self) -> int:
-        """How many, rest included."""
+        """Number of samples, those at rest included."""
         return self.lead + self.timing.shape[1] + self.rest
 
     def motion(self) -> tuple[np.ndarray, np.ndarray]:

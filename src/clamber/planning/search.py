@@ -42,7 +42,7 @@ SILENCE = 1.0  # [s] after which it is said what another thread is trying
 
 
 def threads() -> int:
-    """How many try steps at a time: as many as there are cores.
+    """Number of threads that try steps: one a core.
 
     Fewer where the environment's OMP_NUM_THREADS says so, as it does for processes
     that work side by side.
@@ -67,7 +67,7 @@ F = TypeVar("F")
 
 
 class Entry(Protocol[F]):
-    """What may come next in a search."""
+    """A candidate of a search, which yields its successors."""
 
     @property
     def price(self) -> float:
@@ -89,7 +89,7 @@ class Entry(Protocol[F]):
         ...
 
     def after(self, found: F) -> Iterable[Self]:
-        """What may come after what it has found: asked for in order."""
+        """Successors of this candidate, given its result, in order."""
         ...
 
 
@@ -98,7 +98,7 @@ T = TypeVar("T")
 
 
 class Search:
-    """What the searches of one plan share.
+    """State shared by the searches of one plan.
 
     Attributes:
         ik: Workspace.
@@ -127,7 +127,7 @@ class Search:
 
     @property
     def left(self) -> float | None:
-        """Of the budget, in seconds; None where there is no bound."""
+        """Remaining budget [s]; None without a bound."""
         return None if self._end is None else max(self._end - time.monotonic(), 0.0)
 
     @property
@@ -159,7 +159,7 @@ class Search:
         return found
 
     def each(self, jobs: Sequence[Callable[[Search], T]]) -> list[T]:
-        """What jobs find that do not need one another, several at a time.
+        """Results of independent jobs, run in parallel.
 
         What they try is noted as if one had come after the other.
         """
@@ -266,7 +266,7 @@ class _Aside:
             self._future.cancel()
 
     def result(self, others: Iterable[_Aside]) -> Any:
-        """What it finds; where no thread has begun with it, by this one, at once.
+        """Its result; if no thread has begun it, this one computes it at once.
 
         Args:
             others: Of which one that waits is done while this one is not ready.

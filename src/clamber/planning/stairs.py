@@ -129,7 +129,7 @@ class Flight:
         return [(self._contact(k, t.name, t.near(self._end(t))),) for k, t in knees]
 
     def _end(self, last: _Tread) -> float:
-        """Where the knees come on the last tread: around the goal, if it is near."""
+        """Place of the knees on the last tread [m]: around the goal, if it is near."""
         first = last.edge + self.steps.knee
         middle = self.platform.entry.distance(self.goal) - self.steps.span / 2
         return float(np.clip(middle, first, first + self.steps.gap))
@@ -152,7 +152,7 @@ class Flight:
         return contact_at(surface, top, p, self.platform.entry.yaw)
 
     def _along(self, c: Contact) -> float:
-        """Of a contact's middle, from the edge inwards [m]."""
+        """Distance of a contact's centre from the edge, inwards [m]."""
         x = self.platform.entry.distance(c.position)
         # A foot on tiptoe is where its toes are.
         return x if c.edge is None else x - _half(self.world.surfaces[c.surface])

@@ -213,7 +213,7 @@ def steps_done(
     stance: Sequence[Contact],
     world: World,
 ) -> int:
-    """How many steps of a sequence a stance has done.
+    """Number of steps of a sequence that a stance has completed.
 
     The number after which most limbs are on the surfaces that they are on; a step that
     makes a contact is done only if the contact is there. Of several, the one whose

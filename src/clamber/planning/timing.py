@@ -42,7 +42,7 @@ _FLAT = 1e-3  # a path is no flatter than this: where nothing moves, nothing is 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pace:
-    """What bounds a motion besides joints and contacts.
+    """Bounds of a motion besides joint limits and contact forces.
 
     Attributes:
         speed: Of the fastest joint [rad/s].

@@ -49,7 +49,7 @@ OVER_MIDDLE = 3.0  # weight of the centre of mass between hands and feet, on sta
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Followed:
-    """What following a policy gave.
+    """Result of following a policy.
 
     Attributes:
         route: As far as it goes; neither arrived nor failed where it was cut short.
@@ -84,7 +84,7 @@ class Follower:
         self._quadrupedal = quadrupedal_posture(search.ik, gait)
 
     def next_changes(self, key: Keyframe) -> tuple[Made, Failure | None]:
-        """What is done next, and why nothing; neither where it has arrived."""
+        """The next contact changes, or why there are none; neither at the goal."""
 
         def attempt(proposal: Proposal | Climb) -> Outcome:
             is_climb = isinstance(proposal, Climb)
@@ -155,7 +155,7 @@ class Follower:
 
 
 def followers_of(search: Search, policy: GeneralPolicy) -> list[Follower]:
-    """Of a policy, and of its secondary ones that know how to go on on top."""
+    """Followers of a policy and of its secondary policies that have a cycle on top."""
     others = [p for p in policy.secondary if any(o.region == "O" for o in p.options)]
     world = search.ik.world
     return [Follower(search, Gait(world, p)) for p in (policy, *others)]

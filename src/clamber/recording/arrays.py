@@ -51,7 +51,7 @@ USUAL = {n: names for n, (_, names) in smpl.JOINTS.items()} | {33: _MEDIAPIPE}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Given:
-    """What the user says of an array, or of a robot's or a body's motion.
+    """What the user states about an array, or a robot's or a body's motion.
 
     Attributes:
         names: Of the columns, in place of the file's own.
@@ -106,7 +106,7 @@ def _says(found: Mapping[Any, object]) -> bool:
 
 
 def _read_found(found: dict[str, Any], given: Given, path: Path) -> Points:
-    """Of what a file holds by name: points go before what makes some."""
+    """Points of a file's named arrays; positions go before poses."""
     for field, words in _FIELDS.items():
         if word := next((w for w in words if w in found), None):
             found.setdefault(field, found[word])
@@ -194,5 +194,5 @@ def _load(path: Path) -> dict[str, np.ndarray]:
 
 
 def _fault(error: BaseException) -> str:
-    """What NumPy says of a file, on one line."""
+    """NumPy's error message, on one line."""
     return " ".join(str(error).split())[:80] or type(error).__name__

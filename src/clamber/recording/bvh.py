@@ -70,7 +70,7 @@ def read_bvh(path: Path) -> Points:
 
 
 def _names(joints: list[_Joint]) -> list[str]:
-    """Of the joints; where several people share them, after the person's number."""
+    """Joint names; those of several people are prefixed by the person's number."""
     roots = np.cumsum([j.parent < 0 for j in joints])
     names = [j.name for j in joints]
     if roots[-1] < 2 or len(set(names)) == len(names):
@@ -145,7 +145,7 @@ def _numbers(words: list[str], line: int, path: Path) -> np.ndarray:
 
 
 def _read_motion(file: BinaryIO, path: Path, line: int) -> tuple[float, float, int]:
-    """How many rows there are to be, the rate, and the line of the first one."""
+    """Stated number of rows, the rate [Hz], and the line of the first row."""
     said: list[float] = []
     for key in ("Frames:", "Frame Time:"):
         text = b"\n"

@@ -207,7 +207,7 @@ def _number(parameters: _Parameters, group: str, name: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """Where the samples lie and how."""
+    """Layout of the samples in the file."""
 
     points: int
     analog: int  # numbers of a sample that belong to other devices
@@ -220,7 +220,7 @@ class _Header:
     def read(
         cls, content: np.ndarray, parameters: _Parameters, processor: int, path: Path
     ) -> _Header:
-        """Of the first block, and of the parameters where that has no room for it."""
+        """Reads the first block; what does not fit there, from the parameters."""
         words = _numbers(content[:_BLOCK], "i2", processor).view(np.uint16)
         scale, rate = (
             float(_numbers(content[b : b + 4], "f4", processor)[0]) for b in (12, 20)

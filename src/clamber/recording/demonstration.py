@@ -182,7 +182,7 @@ def build_demonstration(tracks: RawTracks) -> Demonstration:
 
 
 def _say_gaps(gaps: Sequence[Gap]) -> list[str]:
-    """How many were filled, and which were not."""
+    """Notes: the number of filled gaps, and each gap that stays open."""
     short = sum(g.filled for g in gaps)
     out = [f"gaps: {short} short ones filled"] if short else []
     long = [f"{g.point} {g.t0:.2f} to {g.t1:.2f} s" for g in gaps if not g.filled]

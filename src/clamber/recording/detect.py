@@ -290,7 +290,7 @@ def _evidence(demo: Demonstration) -> list[str]:
 
 
 def _window(demo: Demonstration, kind: str) -> _Window:
-    """Of a point without its side."""
+    """Detection window of a kind of point, left or right."""
     part, dot, _ = kind.partition(".")
     usual = estimate_offsets(_SIZE, {}).get(kind, 0.0)
     shift = demo.offsets.get(kind, usual) - usual
@@ -300,7 +300,7 @@ def _window(demo: Demonstration, kind: str) -> _Window:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Nearness:
-    """Of one point over one support: height (T,), and where it could be in contact."""
+    """One point over one support: height (T,) [m], and samples of possible contact."""
 
     height: np.ndarray
     possible: np.ndarray

@@ -59,7 +59,7 @@ def find_levels(demo: Demonstration) -> tuple[Level, ...]:
 
 
 def _level(demo: Demonstration, support: Support, reach: float) -> Level | None:
-    """Of one support, by what rests within `reach` [m] of it; None without evidence."""
+    """Height of a support, by points at rest within `reach` [m]; None without any."""
     for part in _EVIDENCE if reach <= _SEARCH else _LEGS:
         both = [_resting(demo, s + part, support, reach) for s in SIDES]
         clearance = np.concatenate(both)
@@ -73,7 +73,7 @@ def _level(demo: Demonstration, support: Support, reach: float) -> Level | None:
 
 
 def _lowest(clearance: np.ndarray) -> np.ndarray:
-    """Those at the lowest height at which a fair share of them rest."""
+    """The clearances at the lowest height at which a fair share of them lie."""
     x = np.sort(clearance)
     count = np.searchsorted(x, x + _CLUSTER, side="right") - np.arange(len(x))
     if not len(x):
@@ -84,7 +84,7 @@ def _lowest(clearance: np.ndarray) -> np.ndarray:
 
 
 def find_floor(demo: Demonstration) -> Level | None:
-    """Where the floor is by what rests on it, however far off; None: nothing rests."""
+    """Height of the floor, by points at rest on it; None if nothing rests."""
     ground = demo.scene.supports[0]
     near = _level(demo, ground, _SEARCH)
     if near is not None and near.part in _LEGS:
@@ -122,7 +122,7 @@ def settle(demo: Demonstration) -> Demonstration:
 
 
 def say_floor(floor: Level) -> str:
-    """How far feet and floor are apart, which way, and how to correct it."""
+    """A sentence: the offset of feet and floor, its sign, and how to correct it."""
     way = "above" if floor.correction > 0 else "below"
     what = {"Foot": "the feet rest", "Knee": "the knees rest", "Hand": "hands rest"}
     return (

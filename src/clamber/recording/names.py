@@ -160,7 +160,7 @@ _MOST = 0.8  # of all names begin with what says nothing
 
 
 def set_name(kind: str, plain: Sequence[str]) -> str:
-    """What a set of names is called.
+    """Name of a marker set or skeleton.
 
     Args:
         kind: `joints` or `markers`.
@@ -199,7 +199,7 @@ def prefixes_of(names: Sequence[str]) -> list[str]:
 
 
 def _shared(a: str, b: str) -> str:
-    """What both begin with."""
+    """Common prefix of both."""
     pairs = enumerate(zip(a, b, strict=False))
     return a[: next((k for k, (x, y) in pairs if x != y), min(len(a), len(b)))]
 

@@ -48,7 +48,7 @@ class Plain:
 
 
 class _Dtype:
-    """What `numpy.dtype` is told."""
+    """Stand-in for `numpy.dtype`: the arguments that it is called with."""
 
     def __init__(self, code: str = "", *_: object) -> None:
         self.code, self.order = str(code), ""
@@ -174,7 +174,7 @@ class _Reader(pickle._Unpickler):  # pyright: ignore
 
 
 def read_pickle(path: Path) -> object:
-    """What a pickle holds, as plain data.
+    """Contents of a pickle, as plain data.
 
     Raises:
         InputError: It cannot be read, is too large, or calls what is not allowed.
@@ -236,7 +236,7 @@ def as_array(x: object) -> np.ndarray:
 
 
 def _dense(state: dict) -> np.ndarray:
-    """Of a compressed sparse matrix: by columns where that fits, else by rows."""
+    """Dense form of a compressed sparse matrix: CSC if that fits, else CSR."""
     rows, columns = (int(n) for n in state["_shape" if "_shape" in state else "shape"])
     if rows * columns > 10_000_000:
         raise ValueError("too large a matrix")

@@ -77,7 +77,7 @@ class FixedPoint(pydantic.BaseModel):
 
 
 class RecordingFile(pydantic.BaseModel):
-    """What a recording does not say of itself (`recording.yaml`)."""
+    """Facts that a recording does not contain (`recording.yaml`)."""
 
     model_config = pydantic.ConfigDict(extra="forbid")
 
@@ -510,7 +510,7 @@ def _start(raw: np.ndarray, points: list[str]) -> np.ndarray:
 def lower_to_ground(
     boxes: Sequence[Box], ground: str, source: object
 ) -> tuple[tuple[Box, ...], float]:
-    """What remains of the boxes over the chosen ground, and the height it had [m].
+    """Boxes cut at the chosen ground, and that ground's height before [m].
 
     Raises:
         InputError: No box has that name.

@@ -168,7 +168,7 @@ def _quaternions(turn: np.ndarray, w_first: bool) -> tuple[np.ndarray, str]:
 def _columns(
     world: World, names: Sequence[str] | None, count: int, path: Path
 ) -> np.ndarray:
-    """Which of the robot's joints each column is."""
+    """Joint index of each column."""
     own = list(world.joints)
     if names is None and count == len(own):
         return np.arange(count)

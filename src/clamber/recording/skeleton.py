@@ -43,7 +43,7 @@ _HALF_WIDTH = {"Knee": 0.125, "Ankle": 0.08, "Elbow": 0.13}
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Recognised:
-    """What the names of a recording's points mean.
+    """Body parts and landmarks recognised by the names of a recording's points.
 
     Attributes:
         name: Of the marker set or skeleton, for people.
@@ -147,7 +147,7 @@ def _person(prefix: str) -> str:
 def _recognise_one(
     names: Sequence[str], prefix: str, given: Mapping[str, tuple[int, ...]]
 ) -> tuple[Recognised, list[str]]:
-    """What one person's names mean, and what is lacking."""
+    """Parts and landmarks of one person's names, and the missing ones."""
     own = {n[len(prefix) :]: i for i, n in enumerate(names) if n.startswith(prefix)}
     said, plain = read_names(own)
     more = " and `parts`" * bool(given)

@@ -78,7 +78,7 @@ def read_trc(path: Path) -> Points:
 
 
 def _cells(text: str, delimiter: str | None) -> list[str]:
-    """Of a line of heading, without blanks around them."""
+    """Cells of a header line, stripped."""
     if delimiter is None:
         return text.split()
     try:

@@ -41,7 +41,7 @@ _BROKEN = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Form:
-    """How a record stands in a file, where that is not field by field.
+    """File form of a record that is not written field by field.
 
     Attributes:
         names: Keys of fields that are called otherwise there.
@@ -77,11 +77,11 @@ class At:
         return At(value, self.file, f"{self.field}.{key}".lstrip("."))
 
     def error(self, expected: str, value: object = None) -> InputError:
-        """That something about it is not what was expected."""
+        """Error: something about this value is not as expected."""
         return InputError(expected, self.file, self.field or None, value)
 
     def wrong(self, expected: str) -> InputError:
-        """That this value is not what was expected."""
+        """Error: this value is not as expected."""
         return self.error(expected, "null" if self.value is None else self.value)
 
     def object(self) -> dict[str, Any]:
@@ -91,7 +91,7 @@ class At:
         return self.value
 
     def list(self) -> list[At]:
-        """What is in it, a list."""
+        """Items of this value, which must be a list."""
         if not isinstance(self.value, list):
             raise self.wrong("a list")
         return [self.inside(i, x) for i, x in enumerate(self.value)]
@@ -103,7 +103,7 @@ class At:
         return self.inside(name, self.value[name])
 
     def choice(self, of: Mapping[str, Any]) -> Any:
-        """What is called like this."""
+        """Entry of a mapping with this name."""
         if not isinstance(self.value, str) or self.value not in of:
             raise self.wrong(f"one of {', '.join(of)}")
         return of[self.value]
@@ -113,11 +113,11 @@ class Codec:
     """Records to what JSON and npz can say, and back."""
 
     def __init__(self, forms: Mapping[type, Form]) -> None:
-        """Of records that differ in files from their fields."""
+        """`forms`: of records that are not written field by field."""
         self._forms = forms
 
     def _form(self, kind: type) -> Form:
-        """That of a record, or of what it is a kind of."""
+        """Form of a record type, or of a base class."""
         forms = (self._forms[k] for k in kind.__mro__ if k in self._forms)
         return next(forms, Form())
 
@@ -198,7 +198,7 @@ class Codec:
         return x
 
     def _first(self, kinds: tuple[Any, ...], at: At) -> Any:
-        """What the first of several kinds that can makes of it."""
+        """Value as read by the first of several types that accepts it."""
         expected = []
         for kind in kinds:
             try:
@@ -389,7 +389,7 @@ def _text(x: Any, before: str = "\n") -> str:
 
 
 def parse(text: str, at: At, maker: str = "") -> Any:
-    """What a text of JSON says, whose numbers are finite.
+    """Parses JSON; numbers must be finite.
 
     Raises:
         InputError: It is not JSON.
@@ -470,7 +470,7 @@ def _single(x: Any) -> np.ndarray:
 
 
 def _double(x: np.ndarray) -> np.ndarray:
-    """Of single precision in double, row after row."""
+    """Converts single to double precision, row by row."""
     return x.astype(float, order="C") if x.dtype == np.float32 else x
 
 

@@ -40,7 +40,7 @@ WORLD = "world"  # the fixed frame of MCAP's messages
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Motion:
-    """What is exported, sampled.
+    """The sampled motion that is exported.
 
     Attributes:
         world: As planned.

@@ -127,7 +127,7 @@ def _file_of(path: str | Path, name: str) -> Path:
 
 
 def _maker(path: Path) -> str:
-    """What to do where a file is missing, broken or old."""
+    """The command that writes a missing, broken or outdated file."""
     command = _MAKERS.get(path.name)
     return f"`clamber {command}` writes it" if command else "check the path"
 
@@ -227,7 +227,7 @@ def save_plan(plan: Plan, folder: str | Path) -> None:
 
 
 def _save_motion(trajectory: Trajectory | None, folder: Path) -> None:
-    """What is planned, and what is to run."""
+    """Writes the planned trajectory, and the one to be executed."""
     if trajectory is not None:
         save_trajectory(trajectory, folder / PLANNED_TRAJECTORY)
         save_trajectory(in_steps(trajectory), folder / TRAJECTORY)
@@ -328,7 +328,7 @@ def _plan_of(at: At) -> dict[str, Any]:
 
 
 def fallback_note(written: Mapping[str, Any]) -> str:
-    """What the fields of a `plan.json` say of its fallback; empty without one."""
+    """A sentence on the fallback of a `plan.json`; empty without one."""
     fields = written.get("fallback")
     if fields is None:
         return ""
@@ -382,7 +382,7 @@ def load_trajectory(path: str | Path, world: World) -> Trajectory:
 def _sampled(
     arrays: Mapping[str, np.ndarray], shapes: Mapping[str, Any], path: Path
 ) -> dict[str, Any]:
-    """What is sampled of a trajectory that was written as what gives the samples.
+    """Samples of a trajectory that was written by its generating segments.
 
     Raises:
         InputError: They are not those of this robot or do not fit together.
@@ -602,7 +602,7 @@ def load_verdict(folder: str | Path) -> Verdict:
 
 
 def load_fields(folder: str | Path, name: str) -> dict[str, Any]:
-    """What a JSON file of a run folder says, as it is written, once it is checked.
+    """Fields of a JSON file of a run folder, checked.
 
     For what is shown of a run whose other files are missing or broken.
 

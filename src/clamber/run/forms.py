@@ -1,4 +1,4 @@
-"""How records stand in files, where that is not field by field: see docs/files.md."""
+"""File forms of records that are not written field by field: see docs/files.md."""
 
 from __future__ import annotations
 

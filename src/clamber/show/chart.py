@@ -23,7 +23,7 @@ _Series = Mapping[str, np.ndarray]  # (n,) by name
 
 
 def series_of(m: Motion) -> dict[str, _Series]:
-    """What there is to plot of a motion, by title: series (n,) by name."""
+    """Time series of a motion, by title of the plot: series (n,) by name."""
     found: dict[str, _Series] = {}
     margin = {"measured" if m.loads is not None else "planned": m.margin}
     if m.planned_margin is not None:

@@ -45,7 +45,7 @@ NOTHING, BOX = "none", "obstacle "  # what is moved
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Edits:
-    """What is changed of a plan, all of it at once: a step of undoing is another one.
+    """All edits of a plan; each undo step is such a record.
 
     Attributes:
         moved: Support and place (3,) [m] of contacts, by the names of their intervals.

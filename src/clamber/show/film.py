@@ -127,7 +127,7 @@ class Person:
 
     @property
     def name(self) -> str:
-        """What the figure is called: that it is synthetic where it is."""
+        """Caption of the stick figure, which says whether it is synthetic."""
         return "person (synthetic)" if self._skeleton.demo.synthetic else "person"
 
 
@@ -292,7 +292,7 @@ def _frames(
 def taking_turns(
     made: Callable[[range], Generator[T]], count: int, workers: int
 ) -> Generator[T]:
-    """What threads make, each every so many of it, in order.
+    """Results of threads that take turns, in order.
 
     Args:
         made: Makes those of its share, in a thread of their own.

@@ -1,4 +1,4 @@
-"""What a page hands to the browser as a file: the report, a picture, a video."""
+"""Downloads of a page: the report, a picture, a video."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Handout:
         return file
 
     def _video(self, _: Any, there: Path) -> Path:
-        """Of what physics did, as `clamber render --video` draws it."""
+        """Video of the simulation, as `clamber render --video` draws it."""
         assert self._shown is not None
         plan, rollout = self._shown()
         if rollout is None:

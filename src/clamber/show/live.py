@@ -179,7 +179,7 @@ def _show_recording(page: Page, skeleton: Skeleton) -> None:
 
 
 class _Told:
-    """What came of what is shown: the verdict of the run, or of the edited plan."""
+    """The verdict on the page: of the run, or of the edited plan."""
 
     def __init__(self, gui: Any) -> None:
         """Add a line, and a folder of the criteria; empty."""
@@ -191,12 +191,12 @@ class _Told:
             self._rows = gui.add_html("")
 
     def of_run(self, verdict: Verdict | None) -> None:
-        """Of the run as it is in its folder."""
+        """Shows the verdict of the run in its folder."""
         said = "" if verdict is None else _outcome(verdict)
         self._show(said, verdict)
 
     def of_edited(self, verdict: Verdict | None) -> None:
-        """Of a plan that was made on the page; None before physics."""
+        """Shows the verdict of an edited plan; None before its simulation."""
         said = "no verdict yet" if verdict is None else _outcome(verdict)
         self._show(f"edited plan: {said}", verdict)
 
@@ -224,7 +224,7 @@ def _outcome(verdict: Verdict) -> str:
 
 
 class _RunPage:
-    """What the page of a run shows at present: it, or what editing made of it."""
+    """The page of a run: the run itself, or its edited plan."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""What is drawn over a picture: contacts, their forces, the centre of mass, words.
+"""Overlays of a picture: contacts, their forces, the centre of mass, captions.
 
 Marks lie over the robot, since what they show is mostly behind it. They are drawn
 `FINER` times as large as they are seen, so that their edges are smooth.
@@ -55,7 +55,7 @@ class Mark:
 
 @functools.cache
 def font(size: int) -> Any:
-    """Of captions, by its size in pixels."""
+    """Font of captions; `size` in pixels."""
     return ImageFont.load_default(size=size)
 
 

@@ -44,7 +44,7 @@ BONE, BOX = "#1d4ed8", "#cbd5e1"
 
 
 def html(record: object) -> str:
-    """What a notebook shows of a record."""
+    """HTML of a record for a notebook."""
     if isinstance(record, Demonstration):
         line, rows, picture = _demonstration(record)
     elif isinstance(record, ContactSequence):
@@ -127,7 +127,7 @@ def _sequence(sequence: ContactSequence) -> _Cell:
 
 
 def _schedule(sequence: ContactSequence) -> bytes:
-    """Which surface is on which support, over time."""
+    """Picture of contacts over time, by surface."""
     found = {c.surface for s in sequence.stances for c in s.contacts}
     surfaces = [p for p in PARTS if p in found] + sorted(found - set(PARTS))
     supports = dict.fromkeys(c.support for s in sequence.stances for c in s.contacts)

@@ -50,7 +50,7 @@ class Clock:
         self._show = show
 
     def span(self, begin: float, end: float, events: Sequence[float]) -> None:
-        """What there is to play [s], and the times to step through."""
+        """Sets the range of the time line [s], and the events to step through."""
         with self.lock:
             self.begin, self.end, self.events = begin, end, sorted(events)
             self.go(self.t)
@@ -155,12 +155,12 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where the page is, from this machine."""
+        """Address of the page on this machine."""
         name = "localhost" if self.host in ("0.0.0.0", "::", "") else self.host
         return f"http://{f'[{name}]' if ':' in name else name}:{self.port}"
 
     def __repr__(self) -> str:
-        """Where it is."""
+        """Its address."""
         return f"Page({self.url})"
 
     def _repr_html_(self) -> str:
@@ -216,7 +216,7 @@ class Page:
         self._where = where
 
     def span(self, begin: float, end: float, events: Sequence[float]) -> None:
-        """What there is to play [s], and the times to step through."""
+        """Sets the range of the time line [s], and the events to step through."""
         self._slider.min, self._slider.max = begin, max(end, begin + SLIDER_STEP)
         self.clock.span(begin, end, events)
 
@@ -412,7 +412,7 @@ class Work:
         return said
 
     def report(self, stage: str, share: float, note: str) -> None:
-        """How far it is: a stage, its share, and what is at hand."""
+        """Shows progress: a stage, its share, and a note."""
         self._track.update(stage, share)
         self._bar.visible = True
         self._bar.value = 100.0 * self._track.share

@@ -119,7 +119,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Layer:
-    """What is drawn of a scene, with its depth.
+    """A rendered layer of a scene: colours and depth.
 
     Attributes:
         picture: Of the size of what is drawn, not of what is seen.
@@ -132,7 +132,7 @@ class Layer:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Still:
-    """What does not move, drawn from one view.
+    """The static part of a scene, rendered from one view.
 
     Attributes:
         shapes: Beside the scene.
@@ -322,7 +322,7 @@ class Camera:
         return self._movers.geoms[: self._movers.ngeom]
 
     def _covered(self, view: View) -> tuple[_Part, _Part]:
-        """What moves is in a part of the picture, and with its shadows in another.
+        """Regions of the picture with the moving parts, and with their shadows.
 
         Both are whole pixels of each layer. A shadow lies between what casts it and
         where its light meets the lowest height.

@@ -224,7 +224,7 @@ def run_record(
 
 
 def _facts(written: Mapping[str, Any]) -> list[str]:
-    """What the scene is, in a few words."""
+    """The scene in a few words."""
     boxes = written.get("sequence", {}).get("scene", {}).get("boxes", [])
     return [
         f"{b['name']} {' x '.join(f'{x:g}' for x in b['size'])} m, friction "
@@ -269,7 +269,7 @@ def _motion(
     execution: Mapping[str, Any],
     tell: Callable[[float], None],
 ) -> dict[str, Any]:
-    """What is animated and plotted of a run."""
+    """Data of the animation and the plots."""
     world = plan.world if rollout is None else rollout.world
     meshes = body_meshes(world.model, pads=pads_of(world))
     most = max(2, MAX_POSES // (28 * max(len(meshes), 1)))

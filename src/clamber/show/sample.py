@@ -65,7 +65,7 @@ _Loaded = TypeVar("_Loaded")
 
 @dataclass(eq=False, slots=True, kw_only=True)
 class Run:
-    """What could be read of a run folder, and why the rest could not.
+    """The readable parts of a run folder, and why others could not be read.
 
     Attributes:
         folder: The run folder.
@@ -326,7 +326,7 @@ class Motion:
         return found
 
     def phase(self, row: int, surface: int) -> Phase | None:
-        """Of a contact that is planned or loaded at a sample; None where there is none.
+        """Phase of a contact at a sample; None where it is neither planned nor loaded.
 
         Args:
             row: Index of the sample.

@@ -49,7 +49,7 @@ DROP = """<div style="margin: 4px 12px; padding: 8px; font-size: 12px; opacity: 
 
 
 class Choice:
-    """What there is to choose from, and a way to bring another one."""
+    """A list to choose from, and a file drop for another one."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Choice:
         return self._known[str(self._choice.value)]
 
     def say(self, text: str) -> None:
-        """What there is to say of it."""
+        """Shows a line of text below the choice."""
         self._said.content = paragraphs([text])
 
     def _bring(self, name: str, content: bytes) -> None:
@@ -263,7 +263,7 @@ class StartPage:
 
 
 def outcome(climb: Climb, result: ClimbResult) -> str:
-    """How it ended, and the line that does it again."""
+    """The result of a climb, and the command that repeats it."""
     ended = "Success: the robot reached the goal stance."
     if not result.reached:
         ended = f"Failed: {result.why}."

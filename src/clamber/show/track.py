@@ -1,4 +1,4 @@
-"""How far a job has come, and how long it will still take.
+"""Share of a job that is done, and its remaining time.
 
 A job is a list of stages, each of which reports a share of itself. They are weighed by
 what they cost, so that a tenth of the bar is about a tenth of the time.

@@ -208,7 +208,7 @@ def change_contact(
 
 
 def _footings(ik: IK, before: Keyframe, step: Step) -> Iterator[tuple[Contact, ...]]:
-    """What a step may stand on: the contacts that stay, then their feet on tiptoe."""
+    """Support stances of a step: the contacts that stay, then with feet on tiptoe."""
     held = tuple(c for c in before.stance if c.surface not in step.breaks)
     if not held:
         return

@@ -313,7 +313,7 @@ class IK:
         return _residuals(self.core.residuals(self._ask(problem), q))
 
     def _ends(self, segment: str) -> tuple[Places, Places]:
-        """Of a body segment; names are looked up once."""
+        """End points of a body segment; names are looked up once."""
         if segment not in self._segments:
             self._segments[segment] = segment_ends(self.world, segment)
         return self._segments[segment]
@@ -353,7 +353,7 @@ class IK:
 
 
 def as_solution(found: tuple[np.ndarray, int, bool, tuple]) -> Solution:
-    """What the core returns of a solve, as a record."""
+    """The core's result of a solve, as a record."""
     q, iterations, converged, residuals = found
     return Solution(
         q=q,

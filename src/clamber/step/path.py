@@ -117,7 +117,7 @@ _KINDS = ("shift", "swing", "settle")
 def _verdict(
     ik: IK, t: Transition, found: tuple[int, int, float, int, np.ndarray]
 ) -> tuple[Status, str]:
-    """What the core found wrong with a path, in words."""
+    """The core's verdict on a path, in words."""
     status, phase, depth, pair, weak = found
     kind = _KINDS[phase]
     if status == _core.PATH_OPENS:

@@ -1,4 +1,4 @@
-"""How firmly a posture is held when not all is as it is believed to be.
+"""Robust stability margin of a posture, under errors of model and contacts.
 
 The margin of the centre of mass that is left in the worst case of a mass, a friction, a
 centre of mass and contacts that are each a little off: the largest displacement that
@@ -28,7 +28,7 @@ CONTACT = 0.01  # [m]
 
 
 def robust_margin(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> float:
-    """What is left of the margin of the centre of mass in the worst case [m].
+    """Worst-case margin of the centre of mass [m].
 
     Negative where the posture need not hold: so much farther inside the centre of mass
     would have to be.

@@ -130,7 +130,7 @@ def is_stable(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> bo
 
 
 def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) -> str:
-    """Which joint is too weak where there is no static equilibrium at `q` (nq,)."""
+    """Joint whose effort limit prevents static equilibrium at `q` (nq,)."""
     points, load, torque = statics_at(kin, q, contacts)
     needed = strength_needed(points, load, torque)
     if needed is None:

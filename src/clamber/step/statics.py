@@ -127,7 +127,7 @@ class ContactPoints:
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-        """What the core asks for."""
+        """Arrays in the form that the core takes."""
         return self.points, self.normals, self.mu, self.cone_edges
 
 
@@ -180,7 +180,7 @@ class TorqueLimits:
 
     @property
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What the core asks for."""
+        """Arrays in the form that the core takes."""
         return self.jacobian, self.gravity, self.dofs, self.limits
 
     def torques(self, forces: np.ndarray) -> np.ndarray:
@@ -333,7 +333,7 @@ def static_equilibrium(
 def strength_needed(
     contacts: ContactPoints, load: Load, torque: TorqueLimits
 ) -> tuple[float, int] | None:
-    """How many times as strong all joints would have to be, and which one limits that.
+    """Factor on all torque limits at which the load is held, and the limiting joint.
 
     The least s for which forces within the friction cones balance the weight with joint
     torques |tau| <= s limits: an LP. At most 1 where the posture holds.

@@ -247,7 +247,7 @@ Pointing = tuple[Places, Places, np.ndarray, float]
 
 
 def segment_ends(world: World, segment: str) -> tuple[Places, Places]:
-    """Of a body segment by name, such as `left_thigh` or `trunk`."""
+    """End points of a body segment, such as `left_thigh` or `trunk`."""
     limbs = world.robot.limbs
     if segment == "trunk":
         start = [limbs[x].root for x in ("left_leg", "right_leg")]

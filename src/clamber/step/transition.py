@@ -214,7 +214,7 @@ def eased_contacts(
     *,
     margin: float | None = None,
 ) -> tuple[tuple[Contact, ...], Seeds] | None:
-    """Where earlier contacts should have been for a step to be feasible.
+    """Positions of earlier contacts for which a step is feasible.
 
     Solves the move's weight shift with these contacts free on their supports; where
     that works as they are, the posture in which the new contact closes.

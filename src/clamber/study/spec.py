@@ -83,7 +83,7 @@ class PlusMinus(_Strict):
 
 
 def _way(x: Any) -> str:
-    """Which way to write a distribution was meant, so that errors are about that."""
+    """The intended form of a distribution, for error messages."""
     if isinstance(x, PlusMinus) or (isinstance(x, Mapping) and "plus_minus" in x):
         return "plus_minus"
     if isinstance(x, Uniform | Mapping):
@@ -185,7 +185,7 @@ class Search(_Strict):
         return self.from_ + u * (end - self.from_)
 
     def rounded(self, level: float) -> float:
-        """What is run in place of a level."""
+        """The level, rounded to a multiple of `step`."""
         if self.step:
             level = round(level / self.step) * self.step
         return _short(level)
@@ -240,7 +240,7 @@ class Spec(_Strict):
         return self
 
     def __repr__(self) -> str:
-        """What it asks, and what it varies."""
+        """Its question and its factors."""
         return f"Spec(about={self.about!r:.80}, flags={', '.join(self.flags)!r:.80})"
 
     @property

@@ -31,7 +31,7 @@ def wilson(successes: int, runs: int) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Break:
-    """Where success falls through one half.
+    """Level at which the success rate falls through one half.
 
     Attributes:
         half: The level of 50 % success; None: outside [0, 1], see `low` and `high`.
@@ -92,7 +92,7 @@ def fit_break(level: ArrayLike, reached: ArrayLike) -> Break | None:
     bound = top - CHI2 / 2
 
     def end(side: slice) -> float | None:
-        """Where the profile falls below the bound, going outwards."""
+        """Level at which the profile falls below the bound, going outwards."""
         last = centre
         for c in grid[side]:
             if profile(c) < bound:

@@ -49,7 +49,7 @@ Rows = list[tuple[Run, ClimbResult]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pace:
-    """How fast one call went on.
+    """Timing of one call.
 
     Attributes:
         runs: Done in this call.
@@ -69,12 +69,12 @@ class Pace:
 
     @property
     def share(self) -> float:
-        """Of the workers' processors that jobs kept busy."""
+        """Share of the workers' processor time used by jobs."""
         return self.busy / max(self.wall * self.workers, 1e-9)
 
     @property
     def occupied(self) -> float:
-        """Of the workers' time in which they had a job, whatever ran beside them."""
+        """Share of the wall time in which the workers had a job."""
         return self.taken / max(self.wall * self.workers, 1e-9)
 
     @property
@@ -171,7 +171,7 @@ def check_inputs(spec: Spec) -> None:
 
 
 class _Todo:
-    """Which runs are known, done and waiting."""
+    """Known, finished and waiting runs."""
 
     def __init__(self, spec: Spec, done: Mapping[str, ClimbResult]) -> None:
         self._spec = spec
@@ -219,7 +219,7 @@ class _Todo:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Cost:
-    """Of one job: seconds by the clock, and of a processor."""
+    """Cost of one job: wall time and CPU time [s]."""
 
     taken: float
     busy: float
@@ -341,7 +341,7 @@ def _begin_worker(coordinator: int) -> None:
 
 
 def columns(spec: Spec) -> list[str]:
-    """Of `runs.csv`."""
+    """Columns of `runs.csv`."""
     found = [f.name for f in fields(ClimbResult)]
     return ["run", "controller", *spec.factors, "seed", *found, "command"]
 
