@@ -383,6 +383,20 @@ def test_runs_stand_beside_each_other(browser: Any, whole: Path, off_plan: Path)
     assert gaps[0] < 0.35 < gaps[1], gaps
 
 
+def drag_sideways(view: Opened) -> None:
+    """By the mouse on the gizmo's second arrow, along it."""
+    tab = view.tab
+    points = [
+        tab.evaluate(ON_SCREEN, ["/edit/contact", 0.0, s, 0.0]) for s in (0.15, 0.21)
+    ]
+    tab.mouse.move(*points[0])
+    tab.wait_for_timeout(300)
+    tab.mouse.down()
+    tab.mouse.move(*points[1], steps=6)
+    tab.wait_for_timeout(300)
+    tab.mouse.up()
+
+
 def test_a_contact_is_dragged_planned_simulated_and_saved(
     browser: Any, whole: Path, tmp_path: Path
 ):
@@ -399,16 +413,7 @@ def test_a_contact_is_dragged_planned_simulated_and_saved(
         view.until(lambda: gizmo.visible)
         tab.wait_for_timeout(800)
         start = np.array(gizmo.position)
-        points = [
-            tab.evaluate(ON_SCREEN, ["/edit/contact", 0.0, s, 0.0])
-            for s in (0.15, 0.21)
-        ]
-        tab.mouse.move(*points[0])
-        tab.wait_for_timeout(300)
-        tab.mouse.down()
-        tab.mouse.move(*points[1], steps=6)
-        tab.wait_for_timeout(300)
-        tab.mouse.up()
+        drag_sideways(view)
         tab.wait_for_selector("text=LHand on box, stance 1: moved by")
         view.until(lambda: gizmo.position[1] > start[1] + 0.02)
         place = np.array(gizmo.position)
@@ -451,6 +456,12 @@ def test_edits_are_undone_one_by_one_and_the_old_plan_stays_in_sight(
         )
         view.row(HEIGHT).fill("0.3")
         view.row(HEIGHT).press("Enter")
+        tab.wait_for_selector("text=box: 0.300 m high, moved by 0 mm")
+        drag_sideways(view)
+        tab.wait_for_selector("text=box: 0.300 m high, moved by 0 mm", state="detached")
+        moved = tab.get_by_text("box: 0.300 m high, moved by").inner_text()
+        assert 20 < int(re.findall(r"(\d+) mm", moved)[0]) < 150
+        view.click("Undo")
         tab.wait_for_selector("text=box: 0.300 m high, moved by 0 mm")
         view.choose("move", "LHand on box, stance 1")
         view.choose("onto", "ground")

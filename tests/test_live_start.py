@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,11 @@ def test_what_is_chosen_is_climbed_and_the_run_opens(
     def climbed(climb: Climb, *, folder: Path, progress: Any) -> ClimbResult:
         asked.append(climb)
         progress("plan", 0.4, "LHand on box")
-        told_at.append(view.tab)
+        seen.wait(60.0)
         shutil.copytree(whole, folder, dirs_exist_ok=True)
         return ClimbResult(reached=False, why="fell")
 
-    told_at: list[Any] = []
+    seen = threading.Event()
     monkeypatch.setattr(start, "run_climb", climbed)
     with served(browser, ready=READY) as view:
         view.until(lambda: view.orange() > ENOUGH, "the robot that is chosen")
@@ -65,6 +66,10 @@ def test_what_is_chosen_is_climbed_and_the_run_opens(
             .count()
         )
         view.click("Climb")
+        told(view, "plan: LHand on box")
+        bar = view.tab.get_by_role("progressbar")
+        view.until(lambda: float(bar.get_attribute("aria-valuenow")) > 0, "the bar")
+        seen.set()
         view.tab.wait_for_selector('text="speed"')
         assert asked == [Climb(robot="coman", height=0.275)]
         told(view, "failed")  # the verdict of the run
@@ -135,12 +140,12 @@ def test_files_are_dropped_and_what_cannot_be_used_is_said(browser: Any, here: P
         assert np.sum(orange_in(view.picture())) > ENOUGH
         assert [p.name for p in here.glob("runs/uploads/*/*")] == ["step.yaml"]
         view.tab.evaluate(DROP, ["recording", "take.csv", "nothing of use\n"])
-        told(view, "take.csv")
+        told(view, "line 1: expected Motive's CSV")
         view.tab.evaluate(DROP, ["robot", "mine.yaml", "name: mine\n"])
-        told(view, "mine.yaml")
+        told(view, "model: expected a value: it is missing")
         assert view.tab.locator("input[value='coman']").count()
         view.tab.evaluate(DROP, ["scene", "other.yaml", BOX.replace("0.6", "-1")])
-        told(view, "other.yaml")
+        told(view, "boxes.0.size.0 is -1; expected a positive length")
         assert view.tab.locator("input[value='step.yaml']").count()
 
 
