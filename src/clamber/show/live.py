@@ -24,6 +24,7 @@ from clamber.recording.recording import load_demo
 from clamber.run.folder import PLAN, SEQUENCE, fallback_note, load_sequence
 from clamber.show.chart import Chart
 from clamber.show.editor import Editor
+from clamber.show.framing import Preset
 from clamber.show.handout import Handout
 from clamber.show.page import Page, paragraphs, rows_of
 from clamber.show.sample import Run, read_run, thinned
@@ -216,7 +217,7 @@ class _Told:
 
 def _short(limit: str) -> str:
     """A limit in a narrow column."""
-    return limit.replace("at least", "≥").replace("at most", "≤")
+    return limit.replace("at least ", "≥\u00a0").replace("at most ", "≤\u00a0")
 
 
 def _outcome(verdict: Verdict) -> str:
@@ -271,8 +272,11 @@ class _RunPage:
             Handout(page, run.folder, lambda: (self._plan_shown, self._rollout_shown))
         self._plan_shown, self._rollout_shown = plan, run.rollout
         if others:
-            names = ", ".join(str(x.folder) for x in (run, *others))
-            gui.add_html(paragraphs([f"From the robot's left to its right: {names}."]))
+            told_of = (
+                f"{x.folder}: {_outcome(x.verdict) if x.verdict else 'no verdict'}"
+                for x in (run, *others)
+            )
+            gui.add_html(paragraphs(["From the robot's left to its right:", *told_of]))
         page.watch(self._show)
         page.watch_slowly(self._chart.show)
         self._span()
@@ -331,7 +335,8 @@ class _RunPage:
         if self._figure is not None and self._layers[PERSON_LAYER]:
             points = np.concatenate([points, self._figure.seen()])
         fovy = float(world.model.vis.global_.fovy)
-        self._page.look(points, float(world.scene.start[2]), fovy)
+        camera: Preset = "behind" if self._others else "corner"
+        self._page.look(points, float(world.scene.start[2]), fovy, camera)
 
     def _show(self, t: float) -> str:
         if self._figure is not None:

@@ -29,6 +29,7 @@ SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x", "8x")
 SLIDER_STEP = 0.01  # [s]
 STEP = 0.02  # [s] events nearer than this are where one is
 PANEL_WIDTH, ASPECT = 360, 1.2  # [px]; of the picture beside it
+SHEET = 576  # [px] screens narrower than this have the panel as a sheet
 PULLED_BACK = 1.15  # cameras stand so much farther than they must
 UPRIGHT, ABOVE_SHEET = 0.65, 0.4  # a phone's width to height; share above its panel
 PLAY, PAUSE, BACK, ON = "play", "pause", "< contact", "contact >"
@@ -111,6 +112,7 @@ class Page:
         self._watchers: list[Callable[[float], str]] = []
         self._slow_watchers: list[Callable[[float], None]] = []
         self._seen: tuple[np.ndarray, float, float] | None = None
+        self._usual: Preset = "corner"
         self._where: Callable[[float], np.ndarray] | None = None
         self._was = np.zeros(3)
         self._panel_next = 0.0
@@ -183,16 +185,30 @@ class Page:
         """Have it told of times [s] as often as the panel is."""
         self._slow_watchers.append(show)
 
-    def look(self, points: np.ndarray, yaw: float, fovy: float) -> None:
-        """Have cameras take in points (n, 3) [m]: of a new browser, and the presets."""
-        self._seen = (points, yaw, fovy)
-        first = frame_view(points, ASPECT, yaw=yaw, fovy=fovy)
-        camera = self.server.initial_camera
-        camera.position, camera.look_at = eye_of(first), first.lookat
-        camera.up, camera.fov = (0.0, 0.0, 1.0), math.radians(fovy)
+    def look(
+        self, points: np.ndarray, yaw: float, fovy: float, camera: Preset = "corner"
+    ) -> None:
+        """Have cameras take in points (n, 3) [m]: of a new browser, and the presets.
 
-    def aim(self, client: Any, name: Preset = "corner") -> None:
-        """Have a browser look from a preset; a phone above the sheet of its panel."""
+        Args:
+            points: To be in the picture.
+            yaw: Heading of the robot [rad].
+            fovy: Field of view [deg].
+            camera: Preset from which a new browser looks.
+        """
+        self._seen, self._usual = (points, yaw, fovy), camera
+        first = frame_view(points, ASPECT, yaw=yaw, fovy=fovy, camera=camera)
+        initial = self.server.initial_camera
+        initial.position, initial.look_at = eye_of(first), first.lookat
+        initial.up, initial.fov = (0.0, 0.0, 1.0), math.radians(fovy)
+
+    def aim(self, client: Any, name: Preset | None = None) -> None:
+        """Have a browser look from a preset; a phone above the sheet of its panel.
+
+        Args:
+            client: The browser.
+            name: None: the preset from which a new browser looks.
+        """
         if self._seen is None:
             return
         points, yaw, fovy = self._seen
@@ -203,7 +219,7 @@ class Page:
             aspect / share,
             yaw=yaw,
             fovy=2 * math.degrees(math.atan(share * half)),
-            camera=name,
+            camera=name or self._usual,
         )
         reach = float(np.linalg.norm(eye_of(view) - view.lookat))
         down = (1 - share) * half * reach * view.axes[1]
@@ -456,15 +472,20 @@ def paragraphs(texts: Sequence[str]) -> str:
 
 
 def rows_of(rows: Iterable[Sequence[str]]) -> str:
-    """A table as HTML, only its first column broken; the texts are no markup."""
-    look = "padding: 1px 12px 1px 0; vertical-align: top"
-    first, other = f'<td style="{look}">', f'<td style="{look}; white-space: nowrap">'
+    """A table as HTML, only its first column broken; the texts are no markup.
+
+    On a phone, whose panel is narrow, the others are broken too, not cut off.
+    """
+    look = "padding: 1px 8px 1px 0; vertical-align: top"
+    first, other = f'<td style="{look}">', f'<td class="whole" style="{look}">'
+    rule = f"@media (min-width: {SHEET}px) {{ .whole {{ white-space: nowrap }} }}"
     lines = []
     for head, *others in rows:
         cells = [first + html.escape(head), *(other + html.escape(x) for x in others)]
         lines.append(f"<tr>{'</td>'.join(cells)}</td></tr>")
     rows = "".join(lines)
-    return f'<table style="font-size: 13px; margin: 4px 12px">{rows}</table>'
+    table = f'<table style="font-size: 13px; margin: 4px 8px">{rows}</table>'
+    return f"<style>{rule}</style>{table}"
 
 
 def eye_of(view: View) -> np.ndarray:

@@ -186,7 +186,8 @@ class Stage:
         self._kin = Kinematics(m.world)
         self._weight = m.world.mass * 9.81
         add = server.scene
-        self.root = add.add_frame(root, show_axes=False)
+        # Unseen until its bodies are where they belong.
+        self.root = add.add_frame(root, show_axes=False, visible=False)
         meshes = body_meshes(
             m.world.model,
             max_triangles=TRIANGLES,
@@ -244,6 +245,7 @@ class Stage:
             if pale is not None:
                 pale.show(there, poses)
         self._robot.pose(poses)
+        self.root.visible = True
         self._robot.fade(SEE_THROUGH if layers["transparent robot"] else None)
         supports = list(m.world.supports.values())
         found = [

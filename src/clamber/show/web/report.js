@@ -497,7 +497,7 @@ function verdict(run) {
   return table(["criterion", "value", "limit", ""], run.criteria.map(([label, value, limit, ok]) => el("tr", { class: ok ? "" : "failed" }, cells([label, value, limit, ok ? "ok" : "NO"]))), "verdict");
 }
 function events(run, motion) {
-  if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "Every contact was measured where it was planned.");
+  if (!run.events.length) return el("p", { class: "note" }, run.reached === null ? "Not run in physics." : "None: the plan was followed unchanged.");
   const time = (t) => (motion && !motion.stills ? t : null);
   const made = table(["t [s]", "measured during execution"], [], "events"), row = (e) => el("tr", clickable(time(e.time), "this event"), cells([fixed(e.time, 2), e.text]));
   return [made, paged(run.events.length, 40, (from, to) => made.querySelector("tbody").replaceChildren(...run.events.slice(from, to).map(row)))];
