@@ -66,6 +66,16 @@ def test_where_stages_cost_what_is_known_a_share_of_the_time_is_that_of_the_bar(
             assert left == pytest.approx(end - now, abs=0.12 * end)
 
 
+def test_a_job_that_goes_on_counts_the_time_of_what_it_does_anew():
+    clock = Hands()
+    track = Track("sweep", "draw", clock=clock)
+    track.update("sweep", 0.5)
+    assert track.left is None
+    clock.now = 10.0
+    track.update("sweep", 0.75)
+    assert track.left == pytest.approx(10.0, rel=0.05)
+
+
 @pytest.mark.parametrize("stage", CLIMB)
 @pytest.mark.parametrize("factor", [0.2, 5.0])
 def test_the_share_never_falls_and_the_time_left_never_rises(stage: str, factor: float):
@@ -108,6 +118,7 @@ def test_what_falls_back_a_little_goes_on_from_there_without_a_jump():
 def test_a_time_left_that_was_far_too_short_is_said_no_more():
     clock = Hands()
     track = Track("simulate", clock=clock)
+    track.update("simulate", 0.0)
     said = []
     for now, done in ((1.0, 0.2), (10.0, 0.25), (20.0, 0.3), (21.0, 0.9), (22.0, 1.0)):
         clock.now = now

@@ -30,8 +30,8 @@ def bar(console: Console, track: Track, *, more: bool = False) -> Iterator[Progr
         TextColumn("{task.fields[note]}", markup=False),
     )
     with Bar(*columns, console=console, transient=more) as bars:
-        task = bars.add_task("", total=1.0, left="", note="")
-        bars.update(task, completed=track.share)
+        task = bars.add_task("", total=1.0, visible=False, left="", note="")
+        bars.update(task, completed=track.share, visible=True)
         shown = [""]
 
         def report(stage: str, done: float, note: str) -> None:

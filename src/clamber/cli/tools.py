@@ -414,7 +414,6 @@ class SweepCommand:
 
     def run(self) -> int:
         """Spec to table and curves."""
-        from clamber.study import curves, sweep
         from clamber.study.spec import load_spec
 
         if self.workers is not None and self.workers < 1:
@@ -423,6 +422,8 @@ class SweepCommand:
             raise InputError("--workers, --scheduler: give one of them alone")
         spec = load_spec(self.spec)
         folder = self.out or Path("runs") / self.spec.stem
+        from clamber.study import sweep
+
         sweep.check_inputs(spec)
         try:
             with self.output.progress(Track("sweep", "draw")) as report:
@@ -434,6 +435,8 @@ class SweepCommand:
                     progress=report,
                 )
                 report("draw", 0.0, "")
+                from clamber.study import curves  # Matplotlib is slow to import
+
                 curves.save_curves(spec, rows, folder)
                 report("draw", 1.0, "")
         except KeyboardInterrupt:
@@ -455,11 +458,11 @@ class SweepCommand:
                 f"{s.reached} ({100 * s.share:.1f} %)",
                 f"{100 * s.low:.1f} to {100 * s.high:.1f} %",
                 s.half if isinstance(s.half, str) else f"{s.half:.4g}",
-                " to ".join(
+                ""
+                if s.half_from is s.half_to is None
+                else " to ".join(
                     "-" if x is None else f"{x:.4g}" for x in (s.half_from, s.half_to)
-                )
-                if s.factor
-                else "",
+                ),
             )
         note = f"{len(rows)} rows, {pace.runs} of them new; the files are in {folder}"
         errors = sum(s.errors for s in summaries)

@@ -349,6 +349,7 @@ def _write_mp4(
         codec="libx264",
         quality=5,
         macro_block_size=2,
+        ffmpeg_log_level="error",  # a video that is interrupted is no warning of ours
         output_params=[
             "-preset", "veryfast", "-movflags", "+faststart",
             "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",

@@ -9,18 +9,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-# [s] of one core: the built-in climb of COMAN onto a box of 0.275 m, drawn by the
-# processor, by `time.process_time` between the reports of each stage. What a stage
-# costs on another machine, or for another robot, differs by about the same factor.
+# [s] of two cores: the built-in climb of COMAN onto a box of 0.275 m, drawn by the
+# processor, as its timings.json says. What a stage costs on another machine, or for
+# another robot, differs by about the same factor.
 COSTS = {
     "detect": 0.2,
-    "plan": 0.2,
+    "plan": 0.1,
     "trajectory": 0.1,
-    "save": 0.3,
-    "simulate": 2.0,
-    "save run": 0.8,
-    "pictures": 2.5,
-    "video": 11.0,
+    "save": 0.2,
+    "simulate": 1.0,
+    "save run": 0.2,
+    "pictures": 5.0,
+    "video": 14.5,
     "draw": 2.0,
     "report": 2.0,
     "sweep": 200.0,
@@ -52,6 +52,7 @@ class Track:
         self._at, self._inside, self._done = 0, 0.0, 0.0
         self._base, self._from = 0.0, 0.0
         self.share = 0.0
+        self._first: float | None = None  # of a job that goes on where it was stopped
         self.left: float | None = None
         self._believed = False
 
@@ -85,8 +86,10 @@ class Track:
     def _estimate(self) -> None:
         """The time left, corrected downwards alone; not believed when far too short."""
         spent = self._clock() - self._began
-        if self.share >= EARLY:
-            left = spent * (1.0 - self.share) / self.share
+        self._first = self.share if self._first is None else self._first
+        done = self.share - self._first
+        if done >= EARLY:
+            left = spent * (1.0 - self.share) / done
             self.left = left if self.left is None else min(self.left, left)
             self._believed = left < MISJUDGED * self.left + 1.0
 
