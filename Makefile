@@ -105,7 +105,7 @@ front: $(VENV)/.has-video ## the pictures of the first page anew (fetches a G1, 
 	$(BIN)/python docs/tools/front.py $(FRONT) docs/front.webp
 	$(BIN)/clamber render $(FRONT)/crossing --frame 17 --size 960x540 --out docs/crossing.png
 
-experiments: $(VENV)/.has-video ## all experiments and their page in docs (hours; goes on where it stopped)
+experiments: $(VENV)/.has-video ## all experiments and their page in docs (about an hour; goes on where it stopped)
 	for f in examples/experiments/*.yaml; do \
 		$(BIN)/clamber sweep "$$f" --out "runs/$$(basename "$$f" .yaml)" || exit; done
 	$(BIN)/python examples/experiments/page.py runs docs

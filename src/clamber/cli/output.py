@@ -317,7 +317,8 @@ def _strained(rollout: clamber.Rollout) -> str:
     if found is None:
         return ""
     name, limit, seconds = found
-    return f"; {name} was at its effort limit of {limit:g} N m for {seconds:.1f} s"
+    lasted = f"{seconds:.1f} s" if seconds >= 0.1 else f"{1000 * seconds:.0f} ms"
+    return f"; {name} was at its effort limit of {limit:g} N m for {lasted}"
 
 
 def conclude(

@@ -13,7 +13,7 @@ from rich.progress import Progress as Bar
 from clamber.model.progress import Progress
 from clamber.show.track import Track
 
-QUIET = 5.0  # [s] without a line in a log, after which one says what is being done
+QUIET = 3.0  # [s] without a line in a log, after which one says what is being done
 
 
 @contextlib.contextmanager
