@@ -150,7 +150,7 @@ def test_a_log_has_a_line_for_each_tenth_and_each_stage_and_ends_at_the_whole():
 
 
 def test_a_log_says_again_what_takes_long(monkeypatch):
-    monkeypatch.setattr(progress, "QUIET", 0.01)
+    monkeypatch.setattr(progress, "QUIET", 0.2)  # long for two reports
     log, deadline = io.StringIO(), time.monotonic() + 10.0
     with progress.lines(Console(file=log, width=80), progress.Track("plan")) as report:
         report("plan", 0.01, "a step")
