@@ -102,8 +102,10 @@ if __name__ == "__main__":
     if len(sys.argv) != 3:
         sys.exit("usage: python page.py RUNS DOCS")
     docs = Path(sys.argv[2])
-    shutil.rmtree(docs / "experiments", ignore_errors=True)
-    (docs / "experiments").mkdir(parents=True)
+    for name in ORDER:  # what others have put there stays
+        for suffix in (".csv", ".png"):
+            (docs / "experiments" / f"{name}{suffix}").unlink(missing_ok=True)
+    (docs / "experiments").mkdir(parents=True, exist_ok=True)
     text = page(Path(sys.argv[1]), docs / "experiments")
     with whole_file(docs / "experiments.md") as draft:
         draft.write_text(text)
