@@ -581,7 +581,7 @@ def test_pages_name_the_speed_that_is_the_default():
     for name, said in {
         "options.md": f"| `--speed` | {speed};",
         "method.md": f"({speed} by default;",
-        "results.md": f"| {speed}, the default |",
+        "results.md": f"at the default {speed}",
     }.items():
         assert said in (ROOT / "docs" / name).read_text(), name
 
