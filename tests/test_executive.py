@@ -88,6 +88,13 @@ def load(rollout, time: float) -> dict[str, float]:
     return dict(zip(rollout.surfaces, row[:, 2].tolist(), strict=True))
 
 
+def touches_early(told, touch, up, **loads):
+    """Surfaces are loaded where the contact of `touch` is so much higher [m]."""
+    told.to(touch - 100)
+    told.up = up
+    told.to(touch, **loads)
+
+
 def touch_of(plan, change: int) -> int:
     """The last sample before the contact of a change is closed."""
     parts = [s for s in plan.trajectory.segments if s.change == change]
@@ -508,9 +515,7 @@ def test_where_no_other_plan_is_found_the_one_at_hand_may_do(
 ):
     """As far as contacts are not too far off; else it stays where it is."""
     told, touch = Told(hands_plan), touch_of(hands_plan, 0)
-    told.to(touch - 100)
-    told.up = share * FALLBACK
-    told.to(touch, LHand=50.0)
+    touches_early(told, touch, share * FALLBACK, LHand=50.0)
     assert kinds(told.events) == [ContactMoved]
     assert told.events[0].made
     told.until(2)
@@ -529,9 +534,7 @@ def test_with_all_steps_done_there_is_no_need_of_another_plan(
     hands_plan, nothing_found
 ):
     told, touch = Told(hands_plan), touch_of(hands_plan, 1)
-    told.to(touch - 100)
-    told.up = 3.0 * FALLBACK
-    told.to(touch, RHand=50.0)
+    touches_early(told, touch, 3.0 * FALLBACK, RHand=50.0)
     assert kinds(told.events) == [ContactMoved]
     told.finish()
     assert kinds(told.events) == [ContactMoved, KeptStance]
@@ -555,9 +558,7 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
         )
         monkeypatch.setattr(progress, "plan", lambda *_, found=found, **__: found)
         told, touch = Told(hands_plan), touch_of(hands_plan, 0)
-        told.to(touch - 100)
-        told.up = 1.1 * FALLBACK
-        told.to(touch, LHand=50.0)
+        touches_early(told, touch, 1.1 * FALLBACK, LHand=50.0)
         told.until(2)
         if n:  # what it stands on from there on
             told.trajectory, told.k, told.moves = found.trajectory, 299, True
@@ -593,17 +594,13 @@ def test_with_other_contacts_what_is_done_is_counted_by_their_steps(
 
     monkeypatch.setattr(progress, "plan", found)
     told, touch = Told(hands_plan), touch_of(hands_plan, 0)
-    told.to(touch - 100)
-    told.up = 1.1 * FALLBACK
-    told.to(touch, LHand=50.0)
+    touches_early(told, touch, 1.1 * FALLBACK, LHand=50.0)
     told.until(2)
     assert kinds(told.events) == [ContactMoved, Replanned]
     told.trajectory, told.k, told.moves = other.trajectory, 299, True
     told.up = 0.0
     there = other.trajectory.segments[1].end
-    told.to(there - 100)
-    told.up = 1.1 * FALLBACK
-    told.to(there, RHand=50.0)
+    touches_early(told, there, 1.1 * FALLBACK, RHand=50.0)
     told.until(4)
     (first, begun), (second, done) = asked
     assert (first.source, begun) == (hands_plan.sequence.source, 1)
@@ -628,9 +625,7 @@ def test_a_policy_followed_anew_reaches_the_keyframes_of_the_plan(
     found = replace(made, start=made.keyframes[1], changes=changes, trajectory=t)
     monkeypatch.setattr(progress, "plan", lambda *_, **__: found)
     told, touch = Told(made), touch_of(made, 0)
-    told.to(touch - 100)
-    told.up = 1.1 * FALLBACK
-    told.to(touch, LHand=50.0)
+    touches_early(told, touch, 1.1 * FALLBACK, LHand=50.0)
     told.until(2)
     assert kinds(told.events) == [ContactMoved, Replanned]
     replanned = told.executive.core.steps - 1

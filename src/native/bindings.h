@@ -35,14 +35,19 @@ nb::ndarray<nb::numpy, T> new_array(const T* data, std::initializer_list<std::si
     return {copy, shape, owner};
 }
 
+// NumPy arrays that take a vector over.
+template <typename T>
+nb::ndarray<nb::numpy, T, nb::c_contig, nb::device::cpu> own(std::vector<T>&& data,
+                                                             std::vector<std::size_t> shape) {
+    auto* kept = new std::vector<T>(std::move(data));
+    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
+    return {kept->data(), shape.size(), shape.data(), owner};
+}
+
 using Matrix = nb::ndarray<nb::numpy, double, nb::c_contig, nb::device::cpu>;
 
 inline Matrix own(std::vector<double>&& data, std::vector<std::size_t> shape) {
-    auto* kept = new std::vector<double>(std::move(data));
-    nb::capsule owner(kept, [](void* p) noexcept {
-        delete static_cast<std::vector<double>*>(p);
-    });
-    return Matrix(kept->data(), shape.size(), shape.data(), owner);
+    return own<double>(std::move(data), std::move(shape));
 }
 
 inline Matrix own(std::vector<double>&& data) {

@@ -168,14 +168,6 @@ nb::ndarray<nb::numpy, T> view(T* data, std::initializer_list<size_t> shape, nb:
     return nb::ndarray<nb::numpy, T>(data, shape, owner);
 }
 
-// Rows of a table that grows, given away as an array of numpy's.
-template <typename T>
-nb::object taken(std::vector<T>&& values, std::vector<size_t> shape) {
-    auto* kept = new std::vector<T>(std::move(values));
-    nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<T>*>(p); });
-    return nb::cast(nb::ndarray<nb::numpy, T>(kept->data(), shape.size(), shape.data(), owner));
-}
-
 std::vector<Filter::Watched> surfaces_along(const Filter& filter,
                                             const std::vector<int>& surfaces, In normals) {
     want(normals.size() == 3 * surfaces.size(), "a normal for each surface");
@@ -387,18 +379,18 @@ struct Loop {
         auto s = std::move(states);
         states = {};
         nb::dict out;
-        out["ctrl"] = taken(std::move(s.ctrl), {size_t(count), nu});
-        out["qpos"] = taken(std::move(s.qpos), {m, qpos.size()});
-        out["qvel"] = taken(std::move(s.qvel), {m, qvel.size()});
-        out["actuator_force"] = taken(std::move(s.effort), {m, nu});
-        out["contact_force"] = taken(std::move(s.surface), {m, ns, 3});
-        out["unintended"] = taken(std::move(s.other), {m});
-        out["penetration"] = taken(std::move(s.depth), {m});
-        out["contact_step"] = taken(std::move(s.touch_step), {touches});
-        out["contact_geoms"] = taken(std::move(s.touch_geoms), {touches, 2});
-        out["contact_load"] = taken(std::move(s.touch_load), {touches, 2});
+        out["ctrl"] = own(std::move(s.ctrl), {size_t(count), nu});
+        out["qpos"] = own(std::move(s.qpos), {m, qpos.size()});
+        out["qvel"] = own(std::move(s.qvel), {m, qvel.size()});
+        out["actuator_force"] = own(std::move(s.effort), {m, nu});
+        out["contact_force"] = own(std::move(s.surface), {m, ns, 3});
+        out["unintended"] = own(std::move(s.other), {m});
+        out["penetration"] = own(std::move(s.depth), {m});
+        out["contact_step"] = own(std::move(s.touch_step), {touches});
+        out["contact_geoms"] = own(std::move(s.touch_geoms), {touches, 2});
+        out["contact_load"] = own(std::move(s.touch_load), {touches, 2});
         const size_t n = s.end_speed.size();
-        out["end_speed"] = taken(std::move(s.end_speed), {n});
+        out["end_speed"] = own(std::move(s.end_speed), {n});
         return out;
     }
 
@@ -443,7 +435,7 @@ void bind_servo(nb::module_& m) {
             Reals out(n);
             self.command(reference.data(), velocity.data(), torque.data(), measured.data(),
                          follow.data(), out.data());
-            return taken(std::move(out), {n});
+            return own(std::move(out));
         });
     nb::class_<SelfPositioning>(m, "SelfPositioning")
         .def(nb::init<std::vector<std::vector<int>>, std::vector<SelfPositioning::Ankle>, int,
@@ -451,9 +443,7 @@ void bind_servo(nb::module_& m) {
              nb::kw_only(), nb::arg("arms"), nb::arg("ankles"), nb::arg("joints"),
              nb::arg("rate"))
         .def("share", [](SelfPositioning& self, InBool loaded, InBool closed, InBool ahead) {
-            Reals out = self.share(loaded.data(), closed.data(), ahead.data());
-            const size_t n = out.size();
-            return taken(std::move(out), {n});
+            return own(Reals(self.share(loaded.data(), closed.data(), ahead.data())));
         });
     nb::class_<Filter>(m, "Filter")
         .def(nb::init<Reals, int, double, double>(), nb::arg("q"), nb::arg("surfaces"),
@@ -528,7 +518,7 @@ void bind_servo(nb::module_& m) {
             want(q.size() == self.filter.q.size() && force.size() == self.filter.load.size(),
                  "a measurement of this robot");
             self.step(q.data(), force.data(), owner);
-            return taken(Reals(self.command), {self.command.size()});
+            return own(Reals(self.command));
         })
         .def_rw("scale", &Follower::scale)
         .def_rw("ends", &Follower::ends)
@@ -552,9 +542,9 @@ void bind_servo(nb::module_& m) {
         })
         .def("read", [](Sensors& self, In qpos, In force) {
             self.read(qpos.data(), force.data());
-            return nb::make_tuple(taken(Reals(self.q, self.q + qpos.size()), {qpos.size()}),
-                                  taken(Reals(self.force, self.force + force.size()),
-                                        {force.size() / 3, 3}));
+            return nb::make_tuple(own(Reals(self.q, self.q + qpos.size())),
+                                  own(Reals(self.force, self.force + force.size()),
+                                      {force.size() / 3, 3}));
         });
     nb::class_<ContactForces>(m, "ContactForces")
         .def(nb::init<std::vector<int>, int>(), nb::arg("row_of_geom"), nb::arg("surfaces"))
