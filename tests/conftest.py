@@ -132,8 +132,9 @@ def fast_plan(demo_plan):
     from dataclasses import replace
 
     from clamber.planning.trajectory import timed
+    from clamber.step.ik import IK
 
-    trajectory = timed(demo_plan.world, demo_plan.changes, "max")
+    trajectory = timed(IK(demo_plan.world), demo_plan.changes, "max")
     options = replace(demo_plan.options, speed="max")
     return replace(demo_plan, options=options, trajectory=trajectory)
 
@@ -144,6 +145,7 @@ def hands_plan(demo_plan):
     from dataclasses import replace
 
     from clamber.planning.trajectory import timed
+    from clamber.step.ik import IK
 
     changes, stances = demo_plan.changes[:2], demo_plan.sequence.stances
     down = [
@@ -151,7 +153,7 @@ def hands_plan(demo_plan):
         for i, stance in enumerate(stances)
         if {"LHand", "RHand"} <= set(stance.surfaces)
     ]
-    trajectory = timed(demo_plan.world, changes, "max")
+    trajectory = timed(IK(demo_plan.world), changes, "max")
     return replace(
         demo_plan,
         options=replace(demo_plan.options, speed="max"),
@@ -170,14 +172,13 @@ def demo_paths(demo_plan):
     """What the contact changes were made of: their transitions and paths."""
     from clamber.step.ik import IK
     from clamber.step.path import plan_path
-    from clamber.step.transition import plan_transition
+    from clamber.step.transition import plan_shift, plan_transition
 
     ik, keys, out = IK(demo_plan.world), demo_plan.keyframes, []
     for before, after, change in zip(keys, keys[1:], demo_plan.changes, strict=False):
-        transition = plan_transition(
-            ik, before, after, change.step, margin=change.margin
-        )
-        out.append(plan_path(ik, transition))
+        held = change.phases[1].contacts
+        shift = plan_shift(ik, before, change.step, held, margin=change.margin)
+        out.append(plan_path(ik, plan_transition(ik, shift, after, change.step)))
     return out
 
 

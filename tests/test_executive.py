@@ -52,6 +52,7 @@ from clamber.planning.planner import timed
 from clamber.planning.records import Fallback, PlanOptions, State, numbered
 from clamber.planning.trajectory import HOLD_END, HOLD_START
 from clamber.step.change import Failure
+from clamber.step.ik import IK
 from test_gait import POLICY
 
 EXACT = {"noise": 0.0, "delay": 0.0}
@@ -116,7 +117,7 @@ def fast_plan(demo_plan):
 def hands_plan(hands_plan):
     """The same postures at the default speed."""
     speed = PlanOptions().speed
-    trajectory = timed(hands_plan.world, hands_plan.changes, speed)
+    trajectory = timed(IK(hands_plan.world), hands_plan.changes, speed)
     options = replace(hands_plan.options, speed=speed)
     return replace(hands_plan, options=options, trajectory=trajectory)
 
@@ -554,7 +555,9 @@ def test_a_plan_that_goes_less_far_is_taken_where_the_one_at_hand_will_not_do(
             changes=changes,
             failures=(failure,),
             complete=False,
-            trajectory=timed(hands_plan.world, changes or hands_plan.changes, "max"),
+            trajectory=timed(
+                IK(hands_plan.world), changes or hands_plan.changes, "max"
+            ),
         )
         monkeypatch.setattr(progress, "plan", lambda *_, found=found, **__: found)
         told, touch = Told(hands_plan), touch_of(hands_plan, 0)
@@ -578,7 +581,7 @@ def test_with_other_contacts_what_is_done_is_counted_by_their_steps(
         start=hands_plan.keyframes[1],
         sequence=replace(hands_plan.sequence, source="others"),
         changes=numbered(hands_plan.changes[1:], 1),
-        trajectory=timed(hands_plan.world, hands_plan.changes[1:], "max"),
+        trajectory=timed(IK(hands_plan.world), hands_plan.changes[1:], "max"),
         fallback=Fallback(reason="", source="search"),
     )
     asked = []
@@ -621,7 +624,7 @@ def test_a_policy_followed_anew_reaches_the_keyframes_of_the_plan(
     """Its steps begin at 0 again; `when`: after so many changes each was reached."""
     made = replace(hands_plan, policy=POLICY)
     changes = numbered([hands_plan.changes[i] for i in again])
-    t = timed(made.world, changes, "max")
+    t = timed(IK(made.world), changes, "max")
     found = replace(made, start=made.keyframes[1], changes=changes, trajectory=t)
     monkeypatch.setattr(progress, "plan", lambda *_, **__: found)
     told, touch = Told(made), touch_of(made, 0)
@@ -689,7 +692,7 @@ def test_all_surfaces_that_are_loaded_at_the_end_are_rested_on(fast_plan):
 
 def test_ankles_position_themselves_while_both_arms_are_loaded(fast_plan):
     """Then their command goes with the measured angle: a deviation is let alone."""
-    slow = timed(fast_plan.world, fast_plan.changes, 0.3)
+    slow = timed(IK(fast_plan.world), fast_plan.changes, 0.3)
     options = replace(fast_plan.options, speed=0.3)
     fast_plan = replace(fast_plan, trajectory=slow, options=options)
     told, w = Told(fast_plan), fast_plan.world

@@ -53,6 +53,7 @@ from clamber.run.folder import (
     save_verdict,
 )
 from clamber.step.change import Failure
+from clamber.step.ik import IK
 from records import differences, same
 from support.files import box_obj
 
@@ -297,7 +298,7 @@ def test_a_plan_takes_no_more_than_what_gives_its_samples(plan: Plan, copied: Pa
 
 @pytest.mark.parametrize("speed", [0.5, "max"])
 def test_runs_of_any_speed_survive_the_disk(plan: Plan, tmp_path: Path, speed):
-    t = timed(plan.world, plan.changes, speed)
+    t = timed(IK(plan.world), plan.changes, speed)
     save_trajectory(t, tmp_path / "t.npz")
     back = load_trajectory(tmp_path / "t.npz", plan.world)
     assert isinstance(back.q, Samples)

@@ -38,7 +38,7 @@ def ik(coman):
 
 @pytest.fixture(scope="module")
 def goal(demo_sequence, ik):
-    return retarget(demo_sequence, ik.world)
+    return retarget(demo_sequence, ik.kin)
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_what_is_found_is_a_sequence_of_single_moves_that_plans_as_it_is(found, 
         assert step.makes.surface == move.makes.surface
         assert np.allclose(step.makes.position, move.makes.position)
     own = sequence_of(ik.world, found)
-    again = retarget(own, ik.world)
+    again = retarget(own, ik.kin)
     for a, b in zip(again.stances, own.stances, strict=True):
         for c, d in zip(a.contacts, b.contacts, strict=True):
             assert np.linalg.norm(c.position - d.position) < 0.01
@@ -344,7 +344,7 @@ def test_places_beyond_reach_are_not_tried(coman, demo_sequence, tried):
     away = np.array([2.5, 0.0, 0.0])
     box = replace(scene.boxes[0], centre=scene.boxes[0].centre + away)
     ik = IK(build_world(coman, replace(scene, boxes=(box,))))
-    ended = search(ik, retarget(demo_sequence, ik.world), tries=1000)
+    ended = search(ik, retarget(demo_sequence, ik.kin), tries=1000)
     assert why(ended) is Status.EXHAUSTED
     assert all(m.makes.support == "ground" for m in tried)
 
@@ -360,6 +360,6 @@ def test_places_lie_on_their_supports(ik, goal, tried):
 @pytest.mark.slow
 def test_a_box_too_high_for_all_alternatives_has_a_way_up(coman, demo_sequence):
     ik = IK(build_world(coman, Scene.from_height(0.62)))
-    found = search(ik, retarget(demo_sequence, ik.world))
+    found = search(ik, retarget(demo_sequence, ik.kin))
     assert found.arrived
     assert region_of(found.keyframes[-1].stance) == "O"

@@ -24,7 +24,7 @@ from clamber.step.path import (
 from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.posture import CLEARANCE
 from clamber.step.stability import statics_at
-from clamber.step.transition import plan_transition
+from clamber.step.transition import plan_shift, plan_transition
 from oracles import contact_drift
 
 SAFE_HEIGHT, TOP_RISE = 0.05, 0.05  # [m] h_safe of (4.29); of arcs on top
@@ -297,7 +297,9 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
         path = result.changes[k]
         limb, made = path.step.limb, path.step.makes
         keys = result.keyframes[k : k + 2]
-        t = plan_transition(ik, *keys, path.step, margin=path.margin)
+        held = path.phases[1].contacts
+        shift = plan_shift(ik, keys[0], path.step, held, margin=path.margin)
+        t = plan_transition(ik, shift, keys[1], path.step)
         plain = plan_path(ik, t, adapt=False).phases[1].q
         entered.append(min(limb_to_box(result.world, q, limb) for q in plain[1:-1]))
         for q in path.phases[1].q:

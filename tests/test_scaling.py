@@ -95,7 +95,7 @@ def test_a_limb_is_scaled_by_its_length(kin):
 
 
 def test_depth_and_side_are_scaled_height_is_that_of_the_robots_box(world, kin):
-    robot = retarget(climb(), world)
+    robot = retarget(climb(), Kinematics(world))
     scales = limb_scales(PERSON, kin)
     for surface, i, depth, side in (
         ("LHand", 1, 0.2, 0.25),
@@ -111,7 +111,7 @@ def test_depth_and_side_are_scaled_height_is_that_of_the_robots_box(world, kin):
 
 
 def test_feet_start_where_the_robot_stands_and_move_by_scaled_offsets(world, kin):
-    robot = retarget(climb(), world)
+    robot = retarget(climb(), Kinematics(world))
     leg = limb_scales(PERSON, kin)["leg"]
     for foot in ("LFoot", "RFoot"):
         c = robot.stances[0].contact(foot)
@@ -143,7 +143,7 @@ def test_a_plan_of_the_robot_itself_keeps_its_figures(world, kin):
     own = sequence(
         scene, Stance(contacts=feet), Stance(contacts=(*feet, hand)), subject=None
     )
-    again = retarget(own, world)
+    again = retarget(own, Kinematics(world))
     for a, b in zip(own.stances, again.stances, strict=True):
         for c, d in zip(a.contacts, b.contacts, strict=True):
             np.testing.assert_allclose(d.position, c.position, atol=1e-9)
@@ -179,7 +179,9 @@ def test_where_the_recording_lay_and_looked_does_not_matter(world, seed):
     )
     turned = sequence(scene_of(moved, start=(*start[:2], yaw)), *stances)
     for a, b in zip(
-        retarget(there, world).stances, retarget(turned, world).stances, strict=True
+        retarget(there, Kinematics(world)).stances,
+        retarget(turned, Kinematics(world)).stances,
+        strict=True,
     ):
         assert a.surfaces == b.surfaces
         for c, d in zip(a.contacts, b.contacts, strict=True):
@@ -203,9 +205,10 @@ def test_the_robots_contacts_turn_with_its_scene(yaw):
         obstacle, centre=R @ obstacle.centre + at, rotation=R @ obstacle.rotation
     )
     robot = load_robot("coman")
-    plain = retarget(climb(), build_world(robot, scene_of(obstacle)))
+    plain = retarget(climb(), Kinematics(build_world(robot, scene_of(obstacle))))
     turned = retarget(
-        climb(), build_world(robot, scene_of(moved, start=(1.0, -2.0, yaw)))
+        climb(),
+        Kinematics(build_world(robot, scene_of(moved, start=(1.0, -2.0, yaw)))),
     )
     for a, b in zip(plain.stances, turned.stances, strict=True):
         for c, d in zip(a.contacts, b.contacts, strict=True):
@@ -220,7 +223,7 @@ def test_the_robots_contacts_turn_with_its_scene(yaw):
 def test_contacts_lie_on_the_robots_support_however_it_is_tilted(rp):
     tilted = box(0.3, (1.0, 1.2, 0.3), (0.8, 0.0), "crate", rp)
     w = build_world(load_robot("coman"), scene_of(tilted))
-    for s in retarget(climb(), w).stances:
+    for s in retarget(climb(), Kinematics(w)).stances:
         for c in s.contacts:
             height = w.supports[c.support].height(c.position)
             assert height == pytest.approx(0.0, abs=1e-9)
@@ -235,7 +238,7 @@ def test_more_boxes_than_the_robots_scene_has_are_an_input_error(world):
     last = Stance(contacts=(contact("LHand", "shelf", 2.2, 0.1, 0.5),))
     demo = sequence(demo.scene, *demo.stances, last)
     with pytest.raises(InputError, match=r"scene\.boxes is \['box'\].*touches \(2\)"):
-        retarget(demo, world)
+        retarget(demo, Kinematics(world))
 
 
 def test_boxes_are_matched_in_the_order_in_which_they_are_touched():
@@ -246,7 +249,9 @@ def test_boxes_are_matched_in_the_order_in_which_they_are_touched():
     demo = sequence(demo.scene, *demo.stances, last)
     a, b = box(size=(0.8, 1.0, 0.2), name="a"), box(at=(2.5, 0.0), name="b")
     w = build_world(load_robot("coman"), scene_of(a, b))
-    supports = [c.support for s in retarget(demo, w).stances for c in s.contacts]
+    supports = [
+        c.support for s in retarget(demo, Kinematics(w)).stances for c in s.contacts
+    ]
     assert set(supports[:-1]) == {GROUND, "a"}
     assert supports[-1] == "b"
 
@@ -257,7 +262,7 @@ def test_surfaces_that_the_robot_lacks_are_left_out(world):
     with_seat = sequence(
         demo.scene, *demo.stances, Stance(contacts=(seat, *demo.stances[1].contacts))
     )
-    robot = retarget(with_seat, world)
+    robot = retarget(with_seat, Kinematics(world))
     assert robot.stances[3].surfaces == robot.stances[1].surfaces
     assert robot.subject is None
     assert robot.scene is world.scene
@@ -270,5 +275,5 @@ def test_how_the_person_held_the_pelvis_is_not_carried_over(coman):
     posed = replace(
         demo, stances=tuple(replace(s, pelvis=pelvis) for s in demo.stances)
     )
-    there = retarget(posed, build_world(coman, Scene.from_height(0.3)))
+    there = retarget(posed, Kinematics(build_world(coman, Scene.from_height(0.3))))
     assert all(s.pelvis is None for s in there.stances)

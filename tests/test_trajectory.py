@@ -377,7 +377,7 @@ def test_feed_forward_hands_the_load_over_from_old_to_new_contacts(
 
 def test_feed_forward_torques_are_continuous_and_within_effort_limits(demo_plan):
     for speed in (1.0, demo_plan.options.speed):
-        made = timed(demo_plan.world, demo_plan.changes, speed)
+        made = timed(IK(demo_plan.world), demo_plan.changes, speed)
         assert made is not None
         tau = made.tau
         assert np.all(np.abs(tau) <= demo_plan.world.tau_max + 1e-9)

@@ -11,13 +11,18 @@ from clamber import _core
 from clamber.contact.contact import Contact
 from clamber.errors import Status
 from clamber.model.se3 import matrix_from_rpy
+from clamber.step import change
+from clamber.step.change import change_contact
 from clamber.step.ik import IK
+from clamber.step.path import Path
 from clamber.step.polygon import com_margin, support_ellipse, support_polygon
+from clamber.step.posture import KeyframeOptions
 from clamber.step.stability import equilibrium_at, statics_at
 from clamber.step.transition import (
     MARGINS,
     approach_contact,
     balance_problem,
+    plan_shift,
     plan_transition,
     rolled,
 )
@@ -40,6 +45,12 @@ def ik(demo_plan):
 def polygon_of(kin, contacts) -> np.ndarray:
     """Support polygon of contacts at the present posture."""
     return support_polygon(statics_at(kin, kin.q, contacts)[0].points[:, :2])
+
+
+def shifted(ik, before, step):
+    """The weight on the contacts that stay, by the least of `MARGINS`."""
+    held = tuple(c for c in before.stance if c.surface not in step.breaks)
+    return plan_shift(ik, before, step, held, margin=MARGINS[-1])
 
 
 # The orientation of reach-to-support (4.26, 4.27).
@@ -150,9 +161,8 @@ def test_a_worse_posture_is_named(demo_plan, ik):
         replace(s, contact=far) if s.contact.surface == far.surface else s
         for s in after.contacts
     )
-    t = plan_transition(
-        ik, before, replace(after, contacts=states), move, margin=MARGINS[-1]
-    )
+    shift = shifted(ik, before, move)
+    t = plan_transition(ik, shift, replace(after, contacts=states), move)
     assert t.status is Status.UNREACHABLE
     assert t.residuals.contact > 0.01
 
@@ -180,11 +190,48 @@ def test_joints_too_weak_for_a_shift_are_named(demo_plan, ik):
     move = demo_plan.changes[4].step
     weak = IK(replace(ik.world, tau_max=0.05 * ik.world.tau_max))
     strong, feeble = (
-        plan_transition(x, before, after, move, margin=0.025) for x in (ik, weak)
+        plan_transition(x, shifted(x, before, move), after, move) for x in (ik, weak)
     )
     assert strong.status is Status.SOLVED
     assert feeble.status is Status.OVERLOADED
     assert np.array_equal(strong.shifted, feeble.shifted)
+
+
+def test_the_weight_is_shifted_once_wherever_the_contact_goes(
+    demo_plan, ik, monkeypatch
+):
+    """Where it cannot be, no place is looked for."""
+    before, after = demo_plan.keyframes[4:6]
+    asked, places = [], []
+
+    def counted_shift(ik, before, step, held, *, margin):
+        asked.append((held, margin))
+        return plan_shift(ik, before, step, held, margin=margin)
+
+    def found_place(*args, **_):
+        places.append(args)
+        return after
+
+    def no_path(ik, transition):
+        phases = demo_plan.changes[4].phases
+        return Path(transition=transition, phases=phases, status=Status.COLLIDING)
+
+    monkeypatch.setattr(change, "plan_shift", counted_shift)
+    monkeypatch.setattr(change, "direct", found_place)
+    monkeypatch.setitem(change.METHODS, "direct", found_place)
+    monkeypatch.setattr(change, "plan_path", no_path)
+    strong, weak = ik, IK(replace(ik.world, tau_max=0.05 * ik.world.tau_max))
+    step, options = demo_plan.changes[4].step, KeyframeOptions()
+    for x, of_each in ((strong, 2), (weak, 0)):
+        asked.clear()
+        places.clear()
+        found = change_contact(x, before, step, options)
+        expected = Status.COLLIDING if x is strong else Status.OVERLOADED
+        assert found.status is expected
+        assert len(set(asked)) == len(asked)
+        footings = {held for held, _ in asked}
+        assert len(asked) == len(footings) * len(MARGINS)
+        assert len(places) == len(footings) * of_each
 
 
 def test_a_round_surface_does_not_roll_onto_an_edge(ik, demo_plan):

@@ -606,16 +606,24 @@ class Workspace:
     ) -> tuple[int, np.ndarray]:
         """The edge, -1 for none, on which it comes nearest to a point; its middle."""
 
-    def stances(
+    def shift(
         self,
         before: np.ndarray,
+        contacts: list[tuple[np.ndarray, np.ndarray]],
+        margin: float,
+        hint: np.ndarray | None,
+    ) -> tuple[list[tuple[int, np.ndarray]], _Solution, bool]:
+        """Edges of contacts that are let go; weight on the others; does that hold?"""
+
+    def touch(
+        self,
+        shifted: np.ndarray,
         after: np.ndarray,
         contacts: list[tuple[np.ndarray, np.ndarray]],
         margin: float,
-        shifted: np.ndarray | None,
-        touching: np.ndarray | None,
-    ) -> tuple[list[tuple[int, np.ndarray]], list[_Solution], np.ndarray]:
-        """Edges of contacts that are let go; shift and touch; what cannot be held."""
+        hint: np.ndarray | None,
+    ) -> tuple[_Solution, bool]:
+        """The new contact closed and not loaded; does that hold?"""
 
     def path(
         self,

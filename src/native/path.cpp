@@ -402,43 +402,38 @@ Contact PathPlanner::rolled(const Contact& c, const Vec3& towards, const double*
     return out;
 }
 
-void PathPlanner::stances(Transition& t, const double* shifted_hint,
-                          const double* touching_hint, Between& out) {
+bool PathPlanner::shift(Transition& t, const double* hint, Solution& out) {
     Vec3 middle;
     for (const Contact& c : t.held) middle += c.position * (1.0 / t.held.size());
     for (Contact& c : t.rolling) c = rolled(c, middle, t.before.data());
     ask_balance(t.held, t.rolling, t.margin, STANCE_WEIGHT);
     problem_.q_reference = t.before;
-    solver.solve_hard(problem_, t.before.data(), shifted_hint, out.shifted);
-    t.shifted = out.shifted.q;
-    t.touching = t.after;
-    out.touches = t.makes && out.shifted.residuals.solved();
-    if (out.touches) {
-        const Surface& s = model_.surfaces[t.made.surface];
-        solver.kin.update(t.shifted.data());
-        const Vec3 p1 = solver.kin.contact_point(t.made.surface, -1,
-                                                 model_.supports[t.made.support].normal);
-        const Mat3 R_WB = solver.kin.rotation(model_.base);
-        ask_balance(t.held, {t.made}, t.margin, STANCE_WEIGHT);
-        problem_.q_reference.resize(model_.nq);
-        for (int i = 0; i < model_.nq; ++i)
-            problem_.q_reference[i] = 0.5 * (t.shifted[i] + t.after[i]);
-        PointingTask lean;
-        lean.start_body[0] = s.body;
-        lean.start[0] = s.whole.centre;
-        lean.end_body[0] = s.mass_body;
-        lean.end[0] = s.mass_point;
-        lean.direction = lean_direction(p1, t.made.position, R_WB);
-        lean.weight = LEAN_WEIGHT;
-        problem_.pointing.push_back(lean);
-        solver.solve_hard(problem_, t.after.data(), touching_hint, out.touching);
-        t.touching = out.touching.q;
-    }
-    out.weak.clear();
-    if (!out.shifted.residuals.solved()) return;
-    if (out.touches && !out.touching.residuals.solved()) return;
-    if (!is_stable(t.held, t.shifted.data())) out.weak = t.shifted;
-    if (out.touches && !is_stable(t.held, t.touching.data())) out.weak = t.touching;
+    solver.solve_hard(problem_, t.before.data(), hint, out);
+    t.shifted = out.q;
+    return out.residuals.solved() && is_stable(t.held, t.shifted.data());
+}
+
+bool PathPlanner::touch(Transition& t, const double* hint, Solution& out) {
+    const Surface& s = model_.surfaces[t.made.surface];
+    solver.kin.update(t.shifted.data());
+    const Vec3 p1 = solver.kin.contact_point(t.made.surface, -1,
+                                             model_.supports[t.made.support].normal);
+    const Mat3 R_WB = solver.kin.rotation(model_.base);
+    ask_balance(t.held, {t.made}, t.margin, STANCE_WEIGHT);
+    problem_.q_reference.resize(model_.nq);
+    for (int i = 0; i < model_.nq; ++i)
+        problem_.q_reference[i] = 0.5 * (t.shifted[i] + t.after[i]);
+    PointingTask lean;
+    lean.start_body[0] = s.body;
+    lean.start[0] = s.whole.centre;
+    lean.end_body[0] = s.mass_body;
+    lean.end[0] = s.mass_point;
+    lean.direction = lean_direction(p1, t.made.position, R_WB);
+    lean.weight = LEAN_WEIGHT;
+    problem_.pointing.push_back(lean);
+    solver.solve_hard(problem_, t.after.data(), hint, out);
+    t.touching = out.q;
+    return out.residuals.solved() && is_stable(t.held, t.touching.data());
 }
 
 void PathPlanner::plan(const Transition& t, Path& out) {

@@ -28,13 +28,6 @@ struct Transition {
     bool adapt = true;    // push control points away from collisions (4.30)
 };
 
-// The postures between: the weight shifted, the new contact closed but not loaded.
-struct Between {
-    Solution shifted, touching;
-    bool touches = false;      // a contact is made, and the weight could be shifted
-    std::vector<double> weak;  // (nq) the first of them that cannot be held
-};
-
 struct Path {
     enum class Status : int { Solved = 0, Opens = 1, Overlaps = 2, Weak = 3 };
 
@@ -61,10 +54,12 @@ class PathPlanner {
 
     // Where there is none, the phases are as far as they were found.
     void plan(const Transition& t, Path& out);
-    // Shift and touch between the postures before and after; broken contacts roll onto
-    // their edges. The hints are postures that solve similar problems, or none.
-    void stances(Transition& t, const double* shifted_hint, const double* touching_hint,
-                 Between& out);
+    // All old contacts closed, the weight on those that stay; broken ones roll onto their
+    // edges. The hint is a posture that solves a similar problem, or none. Whether the
+    // posture was found and can be held.
+    bool shift(Transition& t, const double* hint, Solution& out);
+    // The same with the weight shifted and the new contact closed, not loaded.
+    bool touch(Transition& t, const double* hint, Solution& out);
     // A flat contact on the edge that lies farthest towards a point, others as they are.
     Contact rolled(const Contact& c, const Vec3& towards, const double* q);
     // What is wrong with the phases of a path.

@@ -555,36 +555,54 @@ void bind_posture(nb::module_& m) {
              },
              "The edge, -1 for none, on which a flat contact comes nearest to a point, and "
              "its middle.")
-        .def("stances",
-             [](Workspace& w, const Array1<>& before, const Array1<>& after,
-                const std::vector<Packed>& contacts, double margin,
-                std::optional<Array1<>> shifted_hint, std::optional<Array1<>> touching_hint) {
+        .def("shift",
+             [](Workspace& w, const Array1<>& before, const std::vector<Packed>& contacts,
+                double margin, std::optional<Array1<>> hint) {
                  Transition t;
                  w.read_contacts_of(t, contacts);
-                 const std::size_t nq = w.model->nq;
-                 t.before.assign(w.posture(before), before.data() + nq);
-                 t.after.assign(w.posture(after), after.data() + nq);
+                 t.before.assign(w.posture(before), before.data() + w.model->nq);
                  t.margin = margin;
-                 const double* hints[2] = {shifted_hint ? w.posture(*shifted_hint) : nullptr,
-                                           touching_hint ? w.posture(*touching_hint) : nullptr};
-                 Between out;
+                 const double* near = hint ? w.posture(*hint) : nullptr;
+                 Solution out;
+                 bool holds = false;
                  {
                      nb::gil_scoped_release released;
                      const std::lock_guard lock(w.busy);
-                     w.planner.stances(t, hints[0], hints[1], out);
+                     holds = w.planner.shift(t, near, out);
                  }
                  nb::list rolling;
                  for (const Contact& c : t.rolling)
                      rolling.append(nb::make_tuple(
                          c.edge, own({c.position.x, c.position.y, c.position.z})));
-                 nb::list found;
-                 found.append(as_tuple(out.shifted));
-                 if (out.touches) found.append(as_tuple(out.touching));
-                 return nb::make_tuple(rolling, found, own(std::move(out.weak)));
+                 return nb::make_tuple(rolling, as_tuple(out), holds);
              },
-             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg().none(),
-             "Edges of broken contacts as they are let go, the solutions of shift and touch, "
-             "and the first of them that cannot be held.")
+             nb::arg(), nb::arg(), nb::arg(), nb::arg().none(),
+             "Edges of broken contacts as they are let go, the solution with the weight on "
+             "the others, and whether it was found and can be held.")
+        .def("touch",
+             [](Workspace& w, const Array1<>& shifted, const Array1<>& after,
+                const std::vector<Packed>& contacts, double margin,
+                std::optional<Array1<>> hint) {
+                 Transition t;
+                 w.read_contacts_of(t, contacts);
+                 if (!t.makes) throw std::invalid_argument("no contact is made");
+                 const std::size_t nq = w.model->nq;
+                 t.shifted.assign(w.posture(shifted), shifted.data() + nq);
+                 t.after.assign(w.posture(after), after.data() + nq);
+                 t.margin = margin;
+                 const double* near = hint ? w.posture(*hint) : nullptr;
+                 Solution out;
+                 bool holds = false;
+                 {
+                     nb::gil_scoped_release released;
+                     const std::lock_guard lock(w.busy);
+                     holds = w.planner.touch(t, near, out);
+                 }
+                 return nb::make_tuple(as_tuple(out), holds);
+             },
+             nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(),
+             "The solution with the new contact closed and not loaded, and whether it was "
+             "found and can be held.")
         .def("path",
              [](Workspace& w, const std::vector<Array1<>>& postures,
                 const std::vector<Packed>& contacts, double margin, bool adapt) {

@@ -101,16 +101,20 @@ def _on(supports: tuple[Support, ...], p: np.ndarray) -> Support:
     return min(supports, key=lambda s: float(np.linalg.norm(s.nearest(p, INSET) - p)))
 
 
-def retarget(sequence: ContactSequence, world: World) -> ContactSequence:
+def retarget(sequence: ContactSequence, kin: Kinematics) -> ContactSequence:
     """Bring a sequence into the robot's scene, at the robot's scale.
 
     Feet that stand on the ground in the first stance are put where the robot starts;
     later ground contacts keep their scaled offset from there.
 
+    Args:
+        sequence: As demonstrated.
+        kin: Workspace of the robot in its scene.
+
     Raises:
         InputError: The scene has fewer boxes than the demonstration touches.
     """
-    kin = Kinematics(world)
+    world = kin.world
     kin.update(world.home)
     scales = limb_scales(dict(sequence.subject) if sequence.subject else None, kin)
     obstacles = _obstacles(sequence, world)

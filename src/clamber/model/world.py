@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import mujoco
 import numpy as np
@@ -180,8 +181,7 @@ def build_world(robot: RobotLike, scene: SceneLike) -> World:
         InputError: The robot or the scene cannot be used.
     """
     robot, scene = load_robot(robot), load_scene(scene)
-    spec = read_description(robot.path).spec
-    _prepare_robot(spec, robot)
+    spec = _prepared(robot).copy()
     spec.option.timestep = PHYSICS_STEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -234,8 +234,13 @@ def _written(spec: mujoco.MjSpec, robot: Robot) -> tuple[mujoco.MjModel, str]:
     return again.compile(), xml
 
 
-def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Free joint at the pelvis, servos on the hinges, geoms by surfaces' names."""
+@lru_cache(maxsize=4)
+def _prepared(robot: Robot) -> mujoco.MjSpec:
+    """Free joint at the pelvis, servos on the hinges, geoms by surfaces' names.
+
+    Kept, since a robot is planned for in many scenes: only to be copied.
+    """
+    spec = read_description(robot.path).spec
     for a in list(spec.actuators):
         spec.delete(a)
     for k in list(spec.keys):
@@ -263,6 +268,7 @@ def _prepare_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
             j.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
         a.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
         a.forcerange = [-limit, limit]
+    return spec
 
 
 def _add_scene(spec: mujoco.MjSpec, scene: Scene) -> None:

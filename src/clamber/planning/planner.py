@@ -277,7 +277,7 @@ class _Task:
         self._search.report("trajectory", 0.0, "")
         self._clock.lap("search")
         speed = self._options.speed
-        trajectory = timed(found.world, found.changes, speed, self._lead)
+        trajectory = timed(self._ik, found.changes, speed, self._lead)
         self._clock.lap("trajectory")
         return replace(found, trajectory=trajectory, timings={**self._clock.laps})
 
@@ -306,7 +306,7 @@ class _Task:
     ) -> Plan:
         """The steps of a sequence that are left, with so many of the weights."""
         world, state = self._ik.world, self._state
-        goal = retarget(sequence, world)
+        goal = retarget(sequence, search.ik.kin)
         steps, skipped = split_steps(goal, world)
         if state is not None:
             if proposer != "demonstrated":
@@ -419,7 +419,7 @@ class _Task:
     def _searched(self, made: Sequence[Plan]) -> Iterator[Ranked]:
         """What is found from where the farthest plan is stuck, or from the start."""
         assert isinstance(self._goal, ContactSequence)
-        goal = retarget(self._goal, self._ik.world)
+        goal = retarget(self._goal, self._ik.kin)
         counts = self._counts
         if counts is None:
             counts = action_counts(goal, self._ik.world)

@@ -22,7 +22,6 @@ import numpy as np
 from clamber.contact.contact import Contact
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.world import World
 from clamber.planning.samples import (
     RATE,
     Run,
@@ -343,7 +342,7 @@ def _runs(kin: Kinematics, phases: Sequence[Phase], speed: Speed) -> list[Run]:
 
 
 def timed(
-    world: World,
+    ik: IK,
     changes: Sequence[Change],
     speed: Speed,
     lead: Sequence[Phase] = (),
@@ -351,7 +350,7 @@ def timed(
     """The trajectory of `lead`, which leads to the first keyframe, and the changes.
 
     Args:
-        world: Robot and scene.
+        ik: Workspace.
         changes: One after the other.
         speed: Largest joint speed [rad/s], or `max`.
         lead: Phases before the first change.
@@ -362,7 +361,6 @@ def timed(
     phases = [*lead, *(p for change in changes for p in change.phases)]
     if not phases:
         return None
-    ik = IK(world)
     for i in range(len(lead), len(phases) - 1):
         if (phases[i].kind, phases[i + 1].kind) == ("settle", "shift"):
             both = phases[i : i + 2]

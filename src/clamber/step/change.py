@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 
@@ -29,8 +30,10 @@ from clamber.step.robust import robust_margin_along
 from clamber.step.stability import limiting_joint, out_of_reach
 from clamber.step.tasks import support_rotation
 from clamber.step.transition import (
+    Shift,
     approach_contact,
     margins_of,
+    plan_shift,
     plan_transition,
     rolled,
 )
@@ -188,17 +191,25 @@ def change_contact(
         Where there is no way, what the last attempt without tiptoe failed at.
     """
     failure = None
-    for held in _footings(ik, before, step):
-        found = None
-        for key in _keyframes(ik, before, step, held, options, method):
-            found = _change(ik, before, key, step, options)
-            if isinstance(found, Change):
-                return found
+    footings = [
+        (held, cache(partial(plan_shift, ik, before, step, held)))
+        for held in _footings(ik, before, step)
+    ]
+    margins = _margins(ik, options)
+    for held, shift in footings:
+        found = _unbalanced(shift, step, margins)
+        if found is None:
+            for key in _keyframes(ik, before, step, held, options, method):
+                found = _change(ik, shift, key, step, options)
+                if isinstance(found, Change):
+                    return found
         failure = failure or found
     if step.turns and step.makes is not None:
-        for held in _footings(ik, before, step):
+        for held, shift in footings:
+            if _unbalanced(shift, step, margins) is not None:
+                continue
             key = _keyframe_turned(ik, before, step, held, options)
-            found = _change(ik, before, replace(key, method=method), step, options)
+            found = _change(ik, shift, replace(key, method=method), step, options)
             if isinstance(found, Change):
                 return found
     if failure is None:
@@ -244,8 +255,30 @@ def _keyframes(
         wanted = next(c for c in key.stance if c.surface == wanted.surface)
 
 
+def _margins(ik: IK, options: KeyframeOptions) -> tuple[float, ...]:
+    margins = margins_of(ik.world)
+    if options.robust:
+        margins = (max(margins[0], ROBUST_BALANCE), ROBUST_BALANCE)
+    return margins
+
+
+def _unbalanced(
+    shift: Callable[..., Shift], step: Step, margins: tuple[float, ...]
+) -> Failure | None:
+    """Why the contacts that stay cannot take the weight, whatever comes next."""
+    for margin in margins:
+        found = shift(margin=margin)
+        if found.status is Status.SOLVED:
+            return None
+    return Failure(status=found.status, step=step, detail=found.note)
+
+
 def _change(
-    ik: IK, before: Keyframe, key: Keyframe, step: Step, options: KeyframeOptions
+    ik: IK,
+    shift: Callable[..., Shift],
+    key: Keyframe,
+    step: Step,
+    options: KeyframeOptions,
 ) -> Change | Failure:
     """The way to a keyframe with the largest of `MARGINS` for which there is one."""
     if key.status is not Status.SOLVED:
@@ -257,11 +290,8 @@ def _change(
             detail = out_of_reach(ik.kin, key.q, step.makes, pair)
         return Failure(status=key.status, step=step, detail=detail)
     status, detail = key.status, ""
-    margins = margins_of(ik.world)
-    if options.robust:
-        margins = (max(margins[0], ROBUST_BALANCE), ROBUST_BALANCE)
-    for margin in margins:
-        transition = plan_transition(ik, before, key, step, margin=margin)
+    for margin in _margins(ik, options):
+        transition = plan_transition(ik, shift(margin=margin), key, step)
         status, detail = transition.status, transition.note
         if status is not Status.SOLVED:
             continue

@@ -47,6 +47,31 @@ APPROACH_WEIGHT = 20.0  # of the moving surface, where the contact may still giv
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Shift:
+    """A posture with the weight on the contacts that stay, or as near as there is.
+
+    Attributes:
+        before: Keyframe it starts from.
+        held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
+        rolling: Contacts that are broken, as they are let go.
+        margin: Of the centre of mass to the border of its polygon [m].
+        solution: The posture.
+        status: SOLVED where it was found and the joints can hold it.
+        note: Which joint cannot.
+    """
+
+    before: Keyframe
+    held: tuple[Contact, ...]
+    rolling: tuple[Contact, ...]
+    margin: float
+    solution: Solution
+    status: Status
+    note: str = ""
+
+    __repr__ = short_repr
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Transition:
     """The postures that move one contact.
 
@@ -59,8 +84,8 @@ class Transition:
         held: Contacts that stay; a foot that goes on tiptoe is on its edge here.
         rolling: Contacts that are broken, as they are let go.
         margin: Of the centre of mass to the border of its polygon, throughout [m].
-        status: Of the worst of its postures, with its residuals; OVERLOADED where the
-            contacts that stay and the joints cannot hold one of them.
+        status: Of the first of its postures that fails, with its residuals; OVERLOADED
+            where the contacts that stay and the joints cannot hold it.
         note: Which joint cannot.
     """
 
@@ -73,7 +98,6 @@ class Transition:
     held: tuple[Contact, ...]
     rolling: tuple[Contact, ...]
     margin: float
-    iterations: int
     status: Status
     residuals: Residuals
     note: str = ""
@@ -152,58 +176,88 @@ def balance_problem(
     )
 
 
-def plan_transition(
+def plan_shift(
     ik: IK,
     before: Keyframe,
-    after: Keyframe,
     step: Step,
+    held: tuple[Contact, ...],
     *,
     margin: float,
-) -> Transition:
-    """Shift, touch and settle between two keyframes.
+) -> Shift:
+    """Put the weight on the contacts that stay; those that are broken still touch.
 
     Args:
         ik: Workspace.
         before: Keyframe it starts from.
-        after: Keyframe it leads to.
-        step: What changes between them.
+        step: What changes; where its new contact goes plays no part.
+        held: Contacts that stay.
         margin: Of the centre of mass to the border of its polygon [m].
     """
-    world = ik.world
-    new = step.makes.surface if step.makes is not None else None
-    held = tuple(c for c in after.stance if c.surface != new)
     leaving = tuple(c for c in before.stance if c.surface in step.breaks)
-    if step.makes is not None:
-        made = next(c for c in after.stance if c.surface == step.makes.surface)
-        step = replace(step, makes=made)
-    edges, found, weak = ik.core.stances(
+    edges, found, holds = ik.core.shift(
         before.q,
-        after.q,
-        packed_parts(world, held, leaving, step.makes),
+        packed_parts(ik.world, held, leaving, None),
         margin,
         step.seeds.shifted,
-        step.seeds.touching,
     )
-    solutions = [as_solution(x) for x in found]
-    worst = max(solutions, key=lambda s: list(Status).index(s.status))
-    status, note = worst.status, ""
-    if len(weak):
-        status, note = Status.OVERLOADED, limiting_joint(ik.kin, weak, held)
-    return Transition(
-        step=step,
-        before=before.q,
-        shifted=solutions[0].q,
-        touching=solutions[1].q if len(solutions) > 1 else after.q,
-        after=after.q,
-        stance=before.stance,
+    solution = as_solution(found)
+    status, note = _verdict(ik, solution, held, holds=holds)
+    return Shift(
+        before=before,
         held=held,
         rolling=tuple(on_edge(c, *x) for c, x in zip(leaving, edges, strict=True)),
         margin=margin,
-        iterations=sum(s.iterations for s in solutions),
+        solution=solution,
         status=status,
         note=note,
-        residuals=worst.residuals,
     )
+
+
+def plan_transition(ik: IK, shift: Shift, after: Keyframe, step: Step) -> Transition:
+    """Touch and settle between a shift and the next keyframe.
+
+    Args:
+        ik: Workspace.
+        shift: Of the weight, from the keyframe before.
+        after: Keyframe it leads to, on the contacts that the shift holds.
+        step: What changes between the keyframes.
+    """
+    world, before, found = ik.world, shift.before, shift.solution
+    touching, status, note = after.q, shift.status, shift.note
+    if step.makes is not None:
+        made = next(c for c in after.stance if c.surface == step.makes.surface)
+        step = replace(step, makes=made)
+        if status is Status.SOLVED:
+            parts = packed_parts(world, shift.held, (), made)
+            packed, holds = ik.core.touch(
+                shift.solution.q, after.q, parts, shift.margin, step.seeds.touching
+            )
+            found = as_solution(packed)
+            touching = found.q
+            status, note = _verdict(ik, found, shift.held, holds=holds)
+    return Transition(
+        step=step,
+        before=before.q,
+        shifted=shift.solution.q,
+        touching=touching,
+        after=after.q,
+        stance=before.stance,
+        held=shift.held,
+        rolling=shift.rolling,
+        margin=shift.margin,
+        status=status,
+        note=note,
+        residuals=found.residuals,
+    )
+
+
+def _verdict(
+    ik: IK, found: Solution, held: tuple[Contact, ...], *, holds: bool
+) -> tuple[Status, str]:
+    """Of a posture on the contacts that stay, and which joint cannot hold it."""
+    if found.status is Status.SOLVED and not holds:
+        return Status.OVERLOADED, limiting_joint(ik.kin, found.q, held)
+    return found.status, ""
 
 
 def eased_contacts(
