@@ -331,7 +331,7 @@ def test_the_repr_of_what_a_change_is_made_of_is_short(demo_plan, demo_paths):
         change.phases[0],
         key,
         key.contacts[0],
-        key.equilibrium,
+        demo_plan.equilibria[-1],
         demo_paths[-1],
         demo_paths[-1].transition,
     ):

@@ -116,14 +116,18 @@ def test_all_of_a_near_box_is_seen_and_of_a_large_one_what_is_near():
 
 def test_a_caption_gives_the_figures_of_the_keyframe(plan: Plan):
     first, last = plan.keyframes[0], plan.keyframes[-1]
-    title, geometry, balance = pictures.keyframe_caption(1, last, plan.changes[0].step)
+    held, step = plan.equilibria, plan.changes[0].step
+    title, geometry, balance = pictures.keyframe_caption(1, last, held[-1], step)
     assert title == "1  air -> LHand on box"
     d = next(c for c in last.contacts if c.contact.surface == "LHand")
     assert f"d LHand {1000 * d.projected_distance:.0f} mm" in geometry
     assert f"CoM margin {1000 * last.com_margin:.0f} mm" in geometry
-    assert f"{last.equilibrium.margin:.2f} m g" in balance
-    assert str(last.equilibrium.limiting) in balance
-    assert pictures.keyframe_caption(0, first, None)[0] == "0  start, on LFoot, RFoot"
+    assert f"{held[-1].margin:.2f} m g" in balance
+    assert str(held[-1].limiting) in balance
+    assert (
+        pictures.keyframe_caption(0, first, held[0], None)[0]
+        == "0  start, on LFoot, RFoot"
+    )
 
 
 def test_forces_of_the_contacts_carry_the_weight(plan: Plan):

@@ -71,11 +71,11 @@ def test_the_demonstration_is_planned_to_its_last_stance(demo_plan):
 
 
 def test_every_keyframe_is_solved_and_held_by_forces(demo_plan, demo_kinematics):
-    for key in demo_plan.keyframes:
+    for key, held in zip(demo_plan.keyframes, demo_plan.equilibria, strict=True):
         assert key.status is Status.SOLVED
         again = equilibrium_at(demo_kinematics, key.q, key.stance)
         assert again.feasible
-        assert again.margin == pytest.approx(key.equilibrium.margin, abs=1e-6)
+        assert again.margin == held.margin
 
 
 def test_contact_optimisation_lowers_the_stability_cost(demo_plan):
@@ -325,7 +325,8 @@ def test_the_other_methods_climb_too(demo_sequence, coman, method, tmp_path, ask
 @pytest.mark.slow
 def test_as_slowly_as_in_the_experiments(demo_sequence, coman, tmp_path, ask_judge):
     result, rollout = climb(demo_sequence, coman, 0.275, tmp_path, speed=0.05)
-    assert np.abs(result.trajectory.v[:, 6:]).max() <= 0.05 * 1.005
+    fastest = np.abs(result.trajectory.v[:, 6:]).max()
+    assert fastest <= 0.05 * 1.01  # it is kept at the points of the time law
     assert judge(result, rollout).reached
     assert refused(ask_judge(tmp_path, 0.275)) == {}
 

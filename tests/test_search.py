@@ -504,7 +504,7 @@ def test_seconds_that_are_spent_leave_what_was_reached(ik, steps):
 def test_a_box_higher_than_flat_feet_reach_is_climbed_on_tiptoe(coman, demo_sequence):
     found = plan(demo_sequence, coman, Scene.from_height(0.56))
     assert found.complete
-    assert all(k.equilibrium.feasible for k in found.keyframes)
+    assert all(e.feasible for e in found.equilibria)
     held = [c for change in found.changes for c in change.phases[1].contacts]
     tiptoe = [c for c in held if c.edge is not None]
     assert {c.surface for c in tiptoe} <= {"LFoot", "RFoot"}

@@ -173,7 +173,7 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
 
     kin, keyframes = Kinematics(plan.world), []
     changes = [None, *plan.changes]
-    for change, key in zip(changes, plan.keyframes, strict=True):
+    for change, key, held in zip(changes, plan.keyframes, plan.equilibria, strict=True):
         move = None if change is None else change.step
         phases = () if change is None else change.phases
         keyframes.append(
@@ -190,8 +190,8 @@ def plan_record(plan: clamber.Plan, clock: Clock | None = None) -> dict[str, Any
                 "com_margin": key.com_margin if math.isfinite(key.com_margin) else None,
                 "robust_margin": robust_margin(kin, key.q, key.stance),
                 "robust_margin_on_way": robust_margin_along(kin, phases),
-                "equilibrium_margin": key.equilibrium.margin,
-                "limiting": key.equilibrium.limiting,
+                "equilibrium_margin": held.margin,
+                "limiting": held.limiting,
             }
         )
     return {

@@ -22,7 +22,7 @@ from clamber.step.change import standing
 from clamber.step.ik import IK
 from clamber.step.path import overlap, watched_pairs
 from clamber.step.posture import Keyframe, KeyframeOptions
-from clamber.step.stability import limiting_joint
+from clamber.step.stability import is_stable, limiting_joint
 
 LEVEL = np.radians(2.0)  # soles as the robot stands
 SAME_HEIGHT = 0.005  # [m] of both soles
@@ -283,7 +283,8 @@ def check_start(ik: IK, start: Keyframe) -> None:
             field="scene.start",
             value=" and ".join(names),
         )
-    if start.com_margin < 0 or not start.equilibrium.feasible:
+    stable = is_stable(ik.kin, start.q, start.stance)
+    if start.com_margin < 0 or not stable:
         why = f"its CoM is {-1e3 * start.com_margin:.0f} mm outside its soles"
         if start.com_margin >= 0:
             why = limiting_joint(ik.kin, start.q, start.stance)

@@ -12,6 +12,7 @@ from clamber.contact.contact import Contact, ContactSequence
 from clamber.contact.policy import GeneralPolicy
 from clamber.contact.steps import Skipped, Step
 from clamber.errors import InputError
+from clamber.model.kinematics import Kinematics
 from clamber.model.records import frozen_array, short_repr
 from clamber.model.shown import Viewed
 from clamber.model.world import World
@@ -20,6 +21,8 @@ from clamber.planning.trajectory import Trajectory
 from clamber.step.change import Change, Failure
 from clamber.step.methods import Method
 from clamber.step.posture import Keyframe, KeyframeOptions
+from clamber.step.stability import equilibrium_at
+from clamber.step.statics import StaticEquilibrium
 
 Source = Literal["alternatives", "search", "secondary"]
 
@@ -299,6 +302,12 @@ class Plan(Viewed):
     def keyframes(self) -> tuple[Keyframe, ...]:
         """The start, then the one after each change."""
         return (self.start, *(c.keyframe for c in self.changes))
+
+    @property
+    def equilibria(self) -> tuple[StaticEquilibrium, ...]:
+        """What holds each keyframe, and how firmly; worked out when it is asked for."""
+        kin = Kinematics(self.world)
+        return tuple(equilibrium_at(kin, k.q, k.stance) for k in self.keyframes)
 
     @property
     def why_not(self) -> str:

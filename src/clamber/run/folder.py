@@ -52,6 +52,7 @@ from clamber.step.change import Change
 from clamber.step.posture import Keyframe
 from clamber.step.robust import robust_margin
 from clamber.step.stability import statics_at
+from clamber.step.statics import static_equilibrium
 
 SEQUENCE = "sequence.json"
 POLICY = "policy.json"
@@ -246,18 +247,19 @@ def _plan_fields(plan: Plan, folder: Path) -> dict[str, Any]:
         "robot": fields,
         "prefixes": dict(robot.prefixes),
         **CODEC.object(plan, without=_NOT_IN_PLAN),
-        "keyframes": [keyframe_fields(k, kin) for k in plan.keyframes],
+        "keyframes": [_keyframe_fields(k, kin) for k in plan.keyframes],
         "changes": [CODEC.object(c, without=("keyframe",)) for c in plan.changes],
     }
 
 
-def keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
-    """A keyframe by the keys of `plan.json`; its robust margin, where forces act."""
-    points, *_ = statics_at(kin, k.q, k.stance)
+def _keyframe_fields(k: Keyframe, kin: Kinematics) -> dict[str, Any]:
+    """A keyframe by the keys of `plan.json`; its margins, and which forces hold it."""
+    points, load, torque = statics_at(kin, k.q, k.stance)
     acting = {"surfaces": points.names, "points": points.points}
     out = CODEC.encode(k)
     out["robust_margin"] = robust_margin(kin, k.q, k.stance)
-    out["static_equilibrium"] |= CODEC.encode(acting)
+    held = static_equilibrium(points, load, torque=torque)
+    out["static_equilibrium"] = CODEC.encode(held) | CODEC.encode(acting)
     return out
 
 

@@ -25,7 +25,6 @@ from clamber.step.ik import Residuals
 from clamber.step.path import Phase
 from clamber.step.posture import Keyframe
 from clamber.step.stability import ContactState
-from clamber.step.statics import StaticEquilibrium
 
 Vector = tuple[float, float, float]
 
@@ -153,11 +152,7 @@ FORMS: dict[type, Form] = {
         more=lambda f: {"stance": f.step and f.step.stance, "reason": str(f)}
     ),
     Phase: Form(columns={"arc": 3}),
-    Keyframe: Form(
-        names={"q": "qpos", "equilibrium": "static_equilibrium"},
-        null={"com_margin": -math.inf},
-    ),
-    StaticEquilibrium: Form(columns={"forces": 3}),
+    Keyframe: Form(names={"q": "qpos"}, null={"com_margin": -math.inf}),
     Residuals: Form(null={"com_margin": -math.inf}),
     Trajectory: Form(names={"q": "qpos", "v": "qvel", "joints": "joint_names"}),
     Event: Form(kinds=tuple(EVENTS.values()), more=lambda e: {"text": str(e)}),

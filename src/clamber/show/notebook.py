@@ -152,9 +152,9 @@ def _schedule(sequence: ContactSequence) -> bytes:
 def _plan(plan: Plan) -> _Cell:
     rows = [["", "change", "CoM margin [mm]", "robust [mm]", "push margin [m g]"]]
     kin = Kinematics(plan.world)
-    for i, key in enumerate(plan.keyframes):
+    for i, (key, held) in enumerate(zip(plan.keyframes, plan.equilibria, strict=True)):
         step = "start" if i == 0 else str(plan.changes[i - 1].step)
-        margin = f"{key.equilibrium.margin:.2f}"
+        margin = f"{held.margin:.2f}"
         robust = f"{1000 * robust_margin(kin, key.q, key.stance):.0f}"
         rows.append([str(i), step, f"{1000 * key.com_margin:.0f}", robust, margin])
     end = "complete" if plan.complete else f"incomplete: {plan.why_not}"

@@ -63,6 +63,7 @@ from clamber.show.renderer import Camera, outline
 from clamber.show.sample import planned_forces, row_at, sample_motion
 from clamber.show.skeleton import skeleton_of
 from clamber.step.posture import Keyframe
+from clamber.step.statics import StaticEquilibrium
 
 CLIMB_FRAMES = 12
 PLOTS = 24.0  # of a run take as long as so many pictures of a sheet
@@ -196,6 +197,7 @@ def keyframe_sheet(
     seen = seen_points(Kinematics(world), postures, CLOSE)
     view = view_of(world, seen, tile[0] / tile[1], camera)
     tiles, steps = [], [None, *(c.step for c in plan.changes)]
+    held = plan.equilibria
     with Camera(world, tile) as drawing:
         still = drawing.still(view)
         for i, key in enumerate(plan.keyframes):
@@ -203,11 +205,13 @@ def keyframe_sheet(
                 report("pictures", i / len(plan.keyframes), "keyframes")
             picture = drawing.shot(key.q, view, still=still)
             mark_keyframe(picture, view, world, key)
-            tiles.append((picture, keyframe_caption(i, key, steps[i])))
+            tiles.append((picture, keyframe_caption(i, key, held[i], steps[i])))
     return _save_sheet(tiles, path, columns=min(4, len(tiles)))
 
 
-def keyframe_caption(i: int, key: Keyframe, step: Step | None) -> list[str]:
+def keyframe_caption(
+    i: int, key: Keyframe, held: StaticEquilibrium, step: Step | None
+) -> list[str]:
     """Three lines: the step that led there, geometry and balance, forces."""
     new = {c.surface for c in key.stance}
     title = "start, on " + ", ".join(c.surface for c in key.stance)
@@ -218,9 +222,10 @@ def keyframe_caption(i: int, key: Keyframe, step: Step | None) -> list[str]:
         for c in key.contacts
         if c.contact.surface in new
     )
-    e = key.equilibrium
-    push = f"push margin {e.margin:.2f} m g" if e.feasible else "not in equilibrium"
-    limit = f", limit {e.limiting}" if e.limiting else ""
+    push = "not in equilibrium"
+    if held.feasible:
+        push = f"push margin {held.margin:.2f} m g"
+    limit = f", limit {held.limiting}" if held.limiting else ""
     return [
         f"{i}  {title}",
         f"{d + '; ' if d else ''}CoM margin {1000 * key.com_margin:.0f} mm",

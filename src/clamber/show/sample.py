@@ -232,12 +232,10 @@ def change_at(changes: Sequence[str], reached: Sequence[float | None], t: float)
 
 
 def force_by_contact(world: World, key: Keyframe) -> dict[str, np.ndarray]:
-    """(3,) [N] of each surface, over all its bearing points; zeros where unknown."""
-    points, *_ = statics_at(Kinematics(world), key.q, key.stance)
+    """(3,) [N] of each surface, over all its bearing points."""
+    points, load, torque = statics_at(Kinematics(world), key.q, key.stance)
     names = np.array(points.names)
-    forces = key.equilibrium.forces
-    if len(names) != len(forces):
-        return {c.surface: np.zeros(3) for c in key.stance}
+    forces = contact_forces(points, load, torque=torque).forces
     return {c.surface: forces[names == c.surface].sum(axis=0) for c in key.stance}
 
 

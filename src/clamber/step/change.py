@@ -266,11 +266,12 @@ def _unbalanced(
     shift: Callable[..., Shift], step: Step, margins: tuple[float, ...]
 ) -> Failure | None:
     """Why the contacts that stay cannot take the weight, whatever comes next."""
+    tried = []
     for margin in margins:
-        found = shift(margin=margin)
-        if found.status is Status.SOLVED:
+        tried.append(shift(margin=margin))
+        if tried[-1].status is Status.SOLVED:
             return None
-    return Failure(status=found.status, step=step, detail=found.note)
+    return Failure(status=tried[-1].status, step=step, detail=tried[-1].note)
 
 
 def _change(

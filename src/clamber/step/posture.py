@@ -30,8 +30,7 @@ from clamber.step.ik import (
     Residuals,
     contact_clearance,
 )
-from clamber.step.stability import ContactState, contact_state, equilibrium_at
-from clamber.step.statics import StaticEquilibrium
+from clamber.step.stability import ContactState, contact_state, is_stable
 from clamber.step.tasks import SurfaceTask, closed, sliding, support_rotation
 
 STABILITY_WEIGHT = 5.0  # w of (4.25)
@@ -100,13 +99,15 @@ class KeyframeOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Keyframe:
-    """An optimised posture and the evidence that it is stable."""
+    """An optimised posture and the evidence that it is stable.
+
+    With how much in reserve, `Plan.equilibria` tells.
+    """
 
     q: np.ndarray
     contacts: tuple[ContactState, ...]
     com: np.ndarray
     com_margin: float
-    equilibrium: StaticEquilibrium
     residuals: Residuals
     status: Status
     method: str
@@ -191,7 +192,7 @@ def finish(
     iterations: int,
     cost_before: float,
 ) -> Keyframe:
-    """Measure a posture: contacts where they are, margins, equilibrium, status.
+    """Measure a posture: contacts where they are, margin, status.
 
     Geometry proposes and statics verifies: a posture counts as stable when every
     constraint holds and forces within friction cones and torque limits exist. Where
@@ -219,10 +220,9 @@ def finish(
     states = tuple(contact_state(kin, c) for c in measured.held)
     cost_after, _ = stability_cost(kin, task, places, options.stability_weight)
     com = kin.com.copy()
-    equilibrium = equilibrium_at(kin, q, measured.held)
     status = residuals.status
     fresh = {c.surface for c in task.new}
-    if status is Status.SOLVED and not equilibrium.feasible:
+    if status is Status.SOLVED and not is_stable(kin, q, measured.held):
         slides = any(
             s.phase == "sliding" and s.contact.surface in fresh for s in states
         )
@@ -232,7 +232,6 @@ def finish(
         contacts=states,
         com=com,
         com_margin=residuals.com_margin,
-        equilibrium=equilibrium,
         residuals=residuals,
         status=status,
         method=method,
