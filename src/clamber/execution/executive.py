@@ -455,6 +455,9 @@ class Executive:
                 yield from self._retreat(self._ref.i)
                 return True
             if found is None:
+                yield from self._stand()  # a robot that rocks bears on it again
+                found = None if self.estimate.is_lost(c) else c
+            if found is None:
                 self._note(GivenUp, surface=c.surface)
                 yield from self._replan(others, others)
                 return True
