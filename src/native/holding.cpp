@@ -101,6 +101,29 @@ TorqueView Holding::torque() const {
 
 double Holding::residual() { return statics_.residual(points(), load(), torque()); }
 
+bool Holding::has_room(double distance) {
+    constexpr double ways[4][2] = {{1.0, 0.0}, {-1.0, 0.0}, {0.0, 1.0}, {0.0, -1.0}};
+    for (const auto& way : ways) {
+        LoadView moved = load();
+        for (int i = 0; i < 2; ++i) moved.com[i] += distance * way[i];
+        if (statics_.residual(points(), moved, torque()) > BALANCE_TOL) return false;
+    }
+    return true;
+}
+
+double Holding::strain() {
+    tau_.resize(limits_.size());
+    torques_with(torque(), nullptr, 1.0, tau_.data());
+    double most = 0.0;
+    for (std::size_t j = 0; j < limits_.size(); ++j)
+        if (limits_[j] > 0.0) most = std::max(most, std::abs(tau_[j]) / limits_[j]);
+    return most;
+}
+
+double Holding::room(double* outward) {
+    return statics_.com_room(points(), load(), torque(), outward);
+}
+
 bool Holding::torques_with(const TorqueView& torque, const double* price, double share,
                            double* tau) {
     forces_.assign(points_.size(), {});

@@ -32,6 +32,12 @@ class Holding {
     // Wrench and torques left over by the least forces, in weights: within
     // `BALANCE_TOL` where friction cones and torques that are counted on hold the robot.
     double residual();
+    // Whether that holds with the centre of mass a distance from where it is, along each
+    // axis; and how far it may be in the worst direction, which is `outward`.
+    bool has_room(double distance);
+    // Of a joint that bears most, the share of what is counted on.
+    double strain();
+    double room(double* outward);
     // (na) torques that balance what is looked at with the least contact forces; where these ask
     // more of a joint than is counted on, with those that do not. `price` of a force at
     // each contact, or none.
@@ -51,7 +57,7 @@ class Holding {
     Vec3 com_;
     double wrench_[6];
     std::vector<std::array<double, 3>> points_, normals_, forces_;
-    std::vector<double> mu_, used_, jacobian_, gravity_, limits_, price_;
+    std::vector<double> mu_, used_, jacobian_, gravity_, limits_, price_, tau_;
     std::vector<int> owner_;
 };
 

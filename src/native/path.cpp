@@ -20,6 +20,8 @@ constexpr double ENDS = 5.0;  // a swing's first and last fifth: supports may be
 constexpr double REACH_ANGLE = 25.0 * M_PI / 180.0;  // phi of (4.27)
 constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
 constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
+constexpr double STRAINED = 0.6;  // share of a torque: it may give way on the way, too
+constexpr int MAX_BORDERS = 4;  // of torques, about the centre of mass of a posture
 
 // Contacts that stay closed in each phase: shift, swing, settle.
 std::array<std::vector<Contact>, 3> closed_contacts(const Transition& t) {
@@ -191,6 +193,10 @@ void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& contr
             problem_.clearance[e.pair] = std::min(problem_.clearance[e.pair], eased);
         }
     solve_node(last, reference_, q);
+    if (!strained_ || static_cast<int>(problem_.borders.size()) >= MAX_BORDERS) return;
+    if (look(t.held, q.data()).has_room(t.margin)) return;
+    border();
+    solve_node(q, reference_, q);
 }
 
 void PathPlanner::swing(const Transition& t, Path& out) {
@@ -208,6 +214,11 @@ void PathPlanner::swing(const Transition& t, Path& out) {
     arc(p1, t.made.position, highest(support, p1, t.made.position), slides, ARC_POINTS,
         model_.length_scale, out.control);
     ask_balance(t.held, {}, t.margin, 0.3);
+    strained_ = false;
+    for (const auto* q : {&t.shifted, &t.touching}) {
+        strained_ = strained_ || look(t.held, q->data()).strain() > STRAINED;
+        if (strained_ && !holding_.has_room(t.margin)) border();
+    }
     SurfaceTask reach = closed_task(model_, t.made);
     reach.kind = TaskKind::Reaching;
     reach.edge = -1;
@@ -402,6 +413,37 @@ Contact PathPlanner::rolled(const Contact& c, const Vec3& towards, const double*
     return out;
 }
 
+// Where the torques that are counted on give way first, at what was looked at last.
+double PathPlanner::border() {
+    double outward[2];
+    const double room = holding_.room(outward);
+    const Vec3 com = solver.kin.com();
+    const double most = outward[0] * com.x + outward[1] * com.y + room;
+    problem_.borders.push_back({outward[0], outward[1], most - problem_.balance_margin});
+    return room;
+}
+
+bool PathPlanner::strengthen(const std::vector<Contact>& contacts, Solution& out) {
+    if (!out.residuals.solved()) return false;
+    const double margin = problem_.balance_margin;
+    bool holds = is_stable(contacts, out.q.data());
+    if (holds && holding_.has_room(margin)) return true;
+    double room = border();
+    for (int i = 0; i < MAX_BORDERS && room < margin - MARGIN_TOL && room > -1.0; ++i) {
+        const int iterations = out.iterations;
+        solver.solve(problem_, out.q.data(), MAX_ITERATIONS, STEP_TOL, first_);
+        if (!first_.residuals.solved()) break;
+        const bool stable = is_stable(contacts, first_.q.data());
+        const double other = border();
+        if (other <= room) break;
+        std::swap(out, first_);
+        out.iterations += iterations;
+        room = other;
+        holds = stable;
+    }
+    return holds;
+}
+
 bool PathPlanner::shift(Transition& t, const double* hint, Solution& out) {
     Vec3 middle;
     for (const Contact& c : t.held) middle += c.position * (1.0 / t.held.size());
@@ -409,8 +451,9 @@ bool PathPlanner::shift(Transition& t, const double* hint, Solution& out) {
     ask_balance(t.held, t.rolling, t.margin, STANCE_WEIGHT);
     problem_.q_reference = t.before;
     solver.solve_hard(problem_, t.before.data(), hint, out);
+    const bool holds = strengthen(t.held, out);
     t.shifted = out.q;
-    return out.residuals.solved() && is_stable(t.held, t.shifted.data());
+    return holds;
 }
 
 bool PathPlanner::touch(Transition& t, const double* hint, Solution& out) {
@@ -432,8 +475,9 @@ bool PathPlanner::touch(Transition& t, const double* hint, Solution& out) {
     lean.weight = LEAN_WEIGHT;
     problem_.pointing.push_back(lean);
     solver.solve_hard(problem_, t.after.data(), hint, out);
+    const bool holds = strengthen(t.held, out);
     t.touching = out.q;
-    return out.residuals.solved() && is_stable(t.held, t.touching.data());
+    return holds;
 }
 
 void PathPlanner::plan(const Transition& t, Path& out) {

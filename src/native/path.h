@@ -87,6 +87,10 @@ class PathPlanner {
     void ask_balance(const std::vector<Contact>& loaded,
                      const std::vector<Contact>& unloaded, double margin,
                      double posture_weight);
+    // Moves the centre of mass to where joints are strong enough to keep its margin, too,
+    // or as near to that as is found. Whether the contacts hold the robot in the end.
+    bool strengthen(const std::vector<Contact>& contacts, Solution& out);
+    double border();
     void swing(const Transition& t, Path& out);
     void swing_node(const Transition& t, const std::vector<Vec3>& control, double share,
                     const std::vector<double>& last, bool between, std::vector<double>& q);
@@ -112,6 +116,7 @@ class PathPlanner {
     Solution first_, second_;
     std::vector<double> tangent_, reference_, clearance_;
     std::vector<unsigned char> aloft_, low_;
+    bool strained_ = false;  // a joint, at an end of the swing
     struct Eased {
         int pair;
         double distance;

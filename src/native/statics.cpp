@@ -174,10 +174,13 @@ double Statics::contact_forces(const ContactPointsView& contacts, const LoadView
 }
 
 double Statics::least_room(const ContactPointsView& contacts, const LoadView& load,
-                           const TorqueView& torque, bool moves, double* yields) {
+                           const TorqueView& torque, bool moves, double* yields,
+                           double* outward) {
     const int edges = contacts.cone_edges, n = contacts.n * edges, na = torque.na;
     const int rows = 6 + na;
     std::fill(yields, yields + contacts.n + na, 0.0);
+    outward[0] = 1.0;
+    outward[1] = 0.0;
     if (n == 0) return -PUSH_LIMIT;
     directions_.resize(3 * n);
     auto* const unit = reinterpret_cast<double(*)[3]>(directions_.data());
@@ -230,7 +233,7 @@ double Statics::least_room(const ContactPointsView& contacts, const LoadView& lo
     const QP qp = pose(2, LP_WEIGHT);
     solver_.settings.primal_tol = 1e-8;
     constexpr double first[4][2] = {{1.0, 0.0}, {0.0, 1.0}, {-1.0, 0.0}, {0.0, -1.0}};
-    double found[60][2], outward[2] = {1.0, 0.0}, inner = -PUSH_LIMIT;
+    double found[60][2], inner = -PUSH_LIMIT;
     Polygon polygon;
     for (int i = 0; i < 60; ++i) {
         const double u[2] = {i < 4 ? first[i][0] : outward[0], i < 4 ? first[i][1] : outward[1]};
@@ -406,7 +409,8 @@ void bind_statics(nb::module_& m) {
               const ContactPointsView contacts = contacts_of(points, normals, mu, edges);
               const TorqueView view = torque_of(torque, contacts.n);
               const nb::gil_scoped_release released;
-              return Statics().com_room(contacts, load_of(com, mass), view);
+              double outward[2];
+              return Statics().com_room(contacts, load_of(com, mass), view, outward);
           });
     m.def("is_statically_stable", [](const Points& points, const Points& normals,
                                      const Array1<>& mu, int edges, const Vector& com) {

@@ -69,15 +69,17 @@ public:
     // (n + na): how fast points and joints give way to the weakest push.
     double push_margin(const ContactPointsView& contacts, const LoadView& load,
                        const TorqueView& torque, double* yields) {
-        return least_room(contacts, load, torque, false, yields);
+        double outward[2];
+        return least_room(contacts, load, torque, false, yields, outward);
     }
 
     // How far the centre of mass may lie elsewhere [m], horizontally, in every direction;
-    // negative: how far it has to, -1 where no place would do.
+    // negative: how far it has to, -1 where no place would do. `outward` (2): unit vector
+    // in the direction in which that is least.
     double com_room(const ContactPointsView& contacts, const LoadView& load,
-                    const TorqueView& torque) {
+                    const TorqueView& torque, double* outward) {
         std::vector<double> yields(contacts.n + torque.na);
-        return least_room(contacts, load, torque, true, yields.data());
+        return least_room(contacts, load, torque, true, yields.data(), outward);
     }
 
     // Whether forces within the friction cones balance gravity.
@@ -86,7 +88,7 @@ public:
 private:
     // The largest push [weights], or displacement of the weight [m], in the worst direction.
     double least_room(const ContactPointsView& contacts, const LoadView& load,
-                      const TorqueView& torque, bool moves, double* yields);
+                      const TorqueView& torque, bool moves, double* yields, double* outward);
     static double* zeroed(std::vector<double>& buffer, std::size_t size) {
         buffer.assign(size, 0.0);
         return buffer.data();

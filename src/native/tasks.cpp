@@ -354,6 +354,11 @@ void Rows::balance(Kinematics& kin, const Problem& problem) {
         if (from.body >= 0) pull(from.body, from.centre, a * (t - 1.0));
         if (to.body >= 0) pull(to.body, to.centre, a * -t);
     }
+    for (const Problem::Border& x : problem.borders) {
+        const Vec3 a{x.x, x.y, 0.0};
+        const double off = dot(a, com) - x.b;
+        if (off > 0.0) want(off, BORDER_WEIGHT, a);
+    }
     if (!problem.over && problem.com_weight > 0.0) {
         double middle[2] = {0.0, 0.0};
         for (int k = 0; k < polygon.n; ++k)

@@ -14,6 +14,7 @@ constexpr double FLAT_WEIGHT = 0.3;      // of a flat surface's turn, against it
 constexpr double EDGE_INSET = 0.015;     // [m] contacts stay this far inside the border
 constexpr double EDGE_RANGE = 0.15;      // [m] ... and have a row where they are nearer
 constexpr double EDGE_ROOM = 0.045;      // [m] ... and round ones should, at no other cost
+constexpr double BORDER_WEIGHT = 20.0;  // of the centre of mass, beyond other borders
 constexpr double EDGE_WEIGHT = 3.0;
 constexpr double ROUGHNESS_WEIGHT = 10.0;  // more distance from what is rough
 
@@ -51,6 +52,10 @@ struct Problem {
     std::array<double, 2> com_target{};
     double com_weight = 0.0;
     bool balance = true;
+    struct Border {
+        double x, y, b;  // (x, y) c <= b of the centre of mass c
+    };
+    std::vector<Border> borders;  // besides those of the polygon, as tasks
     double balance_margin = 0.0, ellipse_weight = 0.0, posture_weight = 0.0;
 };
 
