@@ -20,6 +20,7 @@ from clamber.model.se3 import (
 )
 from clamber.model.world import World, build_world
 from clamber.step.ik import (
+    ARMS_FROM_LEGS,
     DAMPING,
     IK,
     PENALTY,
@@ -1320,3 +1321,32 @@ def test_round_contacts_are_the_same_whatever_problem_came_before(plain):
         p = plain.kin.contact_point(name, w.supports["box"].normal)
         room = np.maximum(b - EDGE_INSET, A @ (p + 0.01)) - A @ p
         assert all(np.isclose(qp.hi, x).any() for x in room[room < 0.15])
+
+
+# Arms keep farther from legs than their clearance: a soft task, too.
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "asked"),
+    [
+        ("LHand", "LKnee", True),
+        ("LElbow", "RFoot", True),
+        ("LHand", "RHand", False),
+        ("LFoot", "RFoot", False),
+        ("LHand", "yawed", False),
+    ],
+)
+def test_links_of_an_arm_and_a_leg_are_farther_apart_where_that_costs_nothing(
+    ik, first, second, asked
+):
+    w = ik.world
+    pair = {w.model.geom(first).id, w.model.geom(second).id}
+    mine = np.array([set(map(int, p)) == pair for p in w.pairs])
+    assert mine.sum() == 1
+    apart = gap(w, w.home, first, second)
+    # A clearance that is kept, but with less to spare than arms ask of legs.
+    short = 0.4 * ARMS_FROM_LEGS
+    clearance = np.where(mine, apart - (ARMS_FROM_LEGS - short), -np.inf)
+    merit = ik.build(problem_of(w, clearance=clearance), w.home).merit
+    cost = 0.5 * (ROUGHNESS_WEIGHT * short) ** 2
+    assert merit == pytest.approx(cost if asked else 0.0, rel=1e-6, abs=1e-12)

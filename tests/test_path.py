@@ -288,7 +288,7 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
     demo_sequence, coman
 ):
     """Figure 4.16: the knees on their way up a high box."""
-    result = plan(demo_sequence, coman, Scene.from_height(0.50))
+    result = plan(demo_sequence, coman, Scene.from_height(0.56))
     knees = [k for k, c in enumerate(result.changes) if "leg" in c.step.limb]
     assert len(knees) == 2
     ik = IK(result.world)

@@ -234,7 +234,7 @@ def test_the_forces_that_hold_it_up_add_up_to_its_weight(ik, results, name):
 def test_both_outer_methods_find_about_the_same_cost(results):
     """Along a valley of it: the hand may be anywhere that the shoulder can be."""
     a, b = (results[n].cost_after for n in OUTER)
-    assert a == pytest.approx(b, abs=1e-3 * results["lbfgs"].cost_before)
+    assert a == pytest.approx(b, abs=2e-3 * results["lbfgs"].cost_before)
     assert results["lbfgs"].iterations < results["gradient"].iterations
 
 

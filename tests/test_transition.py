@@ -234,6 +234,33 @@ def test_the_weight_is_shifted_once_wherever_the_contact_goes(
         assert len(places) == len(footings) * of_each
 
 
+@pytest.mark.parametrize(
+    ("k", "joint", "share"), [(3, "WaistYaw", 0.06), (5, "RShSag", 0.29)]
+)
+def test_the_centre_of_mass_keeps_its_margin_from_what_a_weak_joint_bears(
+    demo_plan, ik, k, joint, share
+):
+    """The joint holds the usual posture, not one whose CoM is as far aside."""
+    before, move = demo_plan.keyframes[k], demo_plan.changes[k].step
+    held = tuple(c for c in before.stance if c.surface not in move.breaks)
+    tau_max = ik.world.tau_max.copy()
+    tau_max[ik.world.joints.index(joint)] *= share
+    weak = IK(replace(ik.world, tau_max=tau_max))
+    usual, found = (
+        plan_shift(x, before, move, held, margin=MARGINS[0]) for x in (ik, weak)
+    )
+
+    def room(q):
+        weak.kin.update(q)
+        points, load, torque = statics_at(weak.kin, q, held)
+        return _core.com_room(*points.arrays, load.com, load.mass, torque.arrays)
+
+    assert 0.005 < room(usual.solution.q) < 0.030
+    assert found.status is Status.SOLVED
+    assert room(found.solution.q) > MARGINS[0] - 0.002
+    assert found.solution.residuals.com_margin > MARGINS[0] - 0.002
+
+
 def test_a_round_surface_does_not_roll_onto_an_edge(ik, demo_plan):
     last = demo_plan.keyframes[-1]
     elbow = last.stance[0]

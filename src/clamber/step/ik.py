@@ -31,7 +31,7 @@ from clamber.errors import Status
 from clamber.model.core import core_of
 from clamber.model.kinematics import Kinematics
 from clamber.model.records import short_repr
-from clamber.model.world import World
+from clamber.model.world import World, limb_links
 from clamber.step.tasks import (
     Places,
     SurfaceTask,
@@ -52,6 +52,9 @@ LIMIT_TOL: float = _core.LIMIT_TOL  # [rad] beyond a joint's limit
 DISTANCE_TOL: float = _core.DISTANCE_TOL  # [m] a distance may fall short by this
 BALANCE_TOL: float = _core.MARGIN_TOL  # [m]
 FURTHER_CLEARANCE: float = _core.FURTHER_CLEARANCE  # [m] a shin beside its knee
+# [m] Arms stay farther from legs than their clearance, of the robot's size, where that
+# costs little: hands and knees that slip by so much come no nearer than planned.
+ARMS_FROM_LEGS = 0.02
 # How much farther than its clearance a part stays from a support [m], by geom and name.
 ExtraClearance = Mapping[tuple[int, str], float]
 NO_EXTRA: ExtraClearance = MappingProxyType({})
@@ -209,6 +212,16 @@ class QP:
     __repr__ = short_repr
 
 
+def _arms_and_legs(world: World) -> np.ndarray:
+    """(P,) bool: pairs of a link of an arm and one of a leg."""
+    links: dict[bool, set[int]] = {True: set(), False: set()}
+    for limb in world.robot.limbs.values():
+        links[limb.is_arm] |= limb_links(world, limb.surfaces[0])
+    bodies = world.model.geom_bodyid[world.pairs]
+    arms, legs = (np.isin(bodies, list(links[k])).any(axis=1) for k in (True, False))
+    return arms & legs
+
+
 class IK:
     """Workspace of the solver: one per world, used again for every posture."""
 
@@ -222,7 +235,7 @@ class IK:
         self.world, self.extra = world, extra
         self.kin = Kinematics(world)
         # What each pair keeps besides its clearance, and whether a part was told to.
-        rough = np.zeros(len(world.pairs))
+        rough = ARMS_FROM_LEGS * world.length_scale * _arms_and_legs(world)
         told = np.zeros(len(world.pairs), dtype=np.uint8)
         for box in world.scene.boxes:
             of_box = world.pairs == world.support_geom[box.name]
