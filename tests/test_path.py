@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,8 +12,12 @@ import pytest
 
 from clamber import _core
 from clamber.errors import Status
+from clamber.model.kinematics import Kinematics
+from clamber.model.robot import load_robot
 from clamber.model.scene import Scene
 from clamber.planning.planner import plan
+from clamber.recording.detect import detect_contacts
+from clamber.recording.recording import load_demo
 from clamber.step.ik import IK
 from clamber.step.path import (
     bridge,
@@ -107,12 +112,22 @@ def test_an_arc_goes_straight_and_rises_once_to_the_apex_of_the_formula(rng):
             apex = min(apex, max(p1[2], p2[2]) + TOP_RISE + SAFE_HEIGHT)
         points = dense(p1, p2, top, on_top)
         assert np.allclose(points[[0, -1]], [p1, p2])
-        assert np.allclose(np.diff(points[:, :2], axis=0), (p2 - p1)[:2] / 4000)
+        gone = (points - p1)[:, :2] @ (p2 - p1)[:2] / np.sum((p2 - p1)[:2] ** 2)
+        assert np.allclose(points[:, :2], p1[:2] + np.outer(gone, (p2 - p1)[:2]))
+        assert np.all(np.diff(gone) > 0)
         z = points[:, 2]
         k = int(np.argmax(z))
         assert z[k] == pytest.approx(apex, abs=1e-4)
         assert np.all(np.diff(z[: k + 1]) >= 0)
         assert np.all(np.diff(z[k:]) <= 0)
+
+
+def test_an_arc_leaves_and_comes_down_upright():
+    """So that a top of another height is met near where it should be."""
+    points = dense([0.0, 0.0, 0.1], [0.6, 0.2, 0.3])
+    for ends in (points[:40], points[-40:]):
+        way = np.ptp(ends, axis=0)
+        assert np.hypot(*way[:2]) < 0.05 * way[2]
 
 
 @pytest.mark.parametrize(("asked", "given"), [(2, 5), (5, 5), (12, 12)])
@@ -183,8 +198,47 @@ def test_the_moving_surface_follows_its_arc(demo_plan, demo_kinematics):
             demo_kinematics.update(q)
             way.append(demo_kinematics.contact_point(made.surface, normal))
         off = [np.linalg.norm(swing.arc - p, axis=1).min() for p in way]
-        assert np.median(off) < 0.02
+        assert np.median(off) < 0.05  # it cuts corners
         assert np.array(way)[:, 2].max() > 0.7 * SAFE_HEIGHT + made.position[2]
+
+
+def test_the_centre_of_mass_does_not_turn_back_in_a_swing(demo_plan, demo_kinematics):
+    """It goes straight: back and forth it would take twice the time."""
+    for path in demo_plan.changes:
+        com = []
+        for q in path.phases[1].q:
+            demo_kinematics.update(q)
+            com.append(demo_kinematics.com[:2].copy())
+        a, way = com[0], com[-1] - com[0]
+        share = np.clip((com - a) @ way / (way @ way), 0, 1)
+        assert np.linalg.norm(com - a - np.outer(share, way), axis=1).max() < 0.015
+
+
+def test_a_foot_swings_onto_the_box_without_entering_it_and_turns_on_the_way():
+    """Its toes point down at first: flat at once or at last, joints turn too far."""
+    source = Path(__file__).parents[1] / "examples/recordings/climb-1-stand.yaml"
+    made = plan(
+        detect_contacts(load_demo(source)), load_robot("coman"), Scene.from_height(0.38)
+    )
+    kin = Kinematics(made.world)
+    feet = [c for c in made.changes if c.step.makes and "Foot" in c.step.makes.surface]
+    assert len(feet) >= 2
+    for change in feet:
+        c, swing = change.step.makes, change.phases[1].q
+        limb, up = change.step.limb, np.array([0.0, 0.0, 1.0])
+        body = made.world.surfaces[c.surface].body
+        ways, turns = [], []
+        for q in halves(kin, swing):
+            kin.update(q)
+            ways.append(np.linalg.norm(kin.contact_point(c.surface, up) - c.position))
+            turns.append(kin.data.xmat[body].reshape(3, 3)[2, 0])
+        assert all(
+            limb_to_box(made.world, q, limb) > -2e-3
+            for q, way in zip(halves(kin, swing), ways, strict=True)
+            if way > 0.02
+        )
+        # No faster at first than throughout, by far.
+        assert abs(turns[2] - turns[0]) < 0.4 * abs(turns[-1] - turns[0]) + 0.1
 
 
 def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinematics):

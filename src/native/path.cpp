@@ -9,6 +9,10 @@ constexpr double TOP_RISE = 0.05;     // [m] both ends on top: the apex is so mu
 constexpr int ARC_POINTS = 12;        // control points of an arc, its ends included
 constexpr int BRIDGE_POINTS = 3;      // at most, where nothing moves far
 constexpr double BRIDGE_STEP = 0.1;   // [rad, m] of the way from one to the next
+constexpr double ARC_WEIGHT = 10.0;        // of the arc ...
+constexpr double SWING_POSTURE_WEIGHT = 3.0;  // ... against posture, and constraints
+constexpr double SWING_COM_WEIGHT = 20.0;  // of the straight way of the centre of mass
+constexpr double TURNED = 0.6;  // share of a swing after which a sole lies as it will
 constexpr double LOOSE_ARC_WEIGHT = 1.0;  // ... where a gap is halved, against posture 1
 constexpr int NODE_ITERATIONS = 25;
 constexpr double NODE_STEP = 0.01;     // [rad] a shorter last step leaves nothing to mend
@@ -66,7 +70,8 @@ void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
     double apex =
         std::max(0.5 * (p1.z + p2.z) + 0.5 * norm(p1 - p2), top + SAFE_HEIGHT * scale);
     if (on_top) apex = std::min(apex, std::max(p1.z, p2.z) + TOP_RISE * scale + SAFE_HEIGHT * scale);
-    // Parabola with the given maximum: z = z1 (1-s) + z2 s + 4 c s (1-s).
+    // Parabola with the given maximum: z = z1 (1-s) + z2 s + 4 c s (1-s). The limb leaves
+    // and comes down upright, so that it meets a top that is higher or lower where it should.
     const double a = apex - p1.z, b = apex - p2.z;
     double c = 0.0;
     if (a > 0.0 && b > 0.0) {
@@ -77,8 +82,8 @@ void arc(const Vec3& p1, const Vec3& p2, double top, bool on_top, int points,
     out.resize(n);
     for (int i = 0; i < n; ++i) {
         const double s = static_cast<double>(i) / (n - 1);
-        out[i] = p1 + (p2 - p1) * s;
-        out[i].z += 4.0 * c * s * (1.0 - s);
+        out[i] = p1 + (p2 - p1) * (s * s * (3.0 - 2.0 * s));
+        out[i].z = p1.z + (p2.z - p1.z) * s + 4.0 * c * s * (1.0 - s);
     }
 }
 
@@ -172,11 +177,19 @@ void PathPlanner::swing_node(const Transition& t, const std::vector<Vec3>& contr
     SurfaceTask& reach = problem_.tasks.back();
     reach.position = control[i] + (control[i + 1] - control[i]) * (x - i);
     reach.weight = halves ? LOOSE_ARC_WEIGHT : ARC_WEIGHT;
-    problem_.posture_weight = halves ? 1.0 : 0.3;
+    const double left = std::max(1.0 - share / TURNED, 0.0) * norm(turn_);
+    reach.rotation = left > 0.0 ? axis_angle(turn_ * (1.0 / norm(turn_)), -left) * made_rotation_
+                                : made_rotation_;
+    problem_.posture_weight = halves ? 1.0 : SWING_POSTURE_WEIGHT;
+    for (int k = 0; k < 2; ++k)
+        problem_.com_target[k] = com_[0][k] + share * (com_[1][k] - com_[0][k]);
+    // From where the last posture is, not back to the way that the arc has left: joints
+    // would turn to and fro, and a foot be drawn through an edge.
+    const double step = 1.0 / (n - 1);
     if (halves)
         reference_ = last;
     else
-        between(t.shifted, t.touching, share, reference_);
+        between(last, t.touching, step / (1.0 - share + step), reference_);
     problem_.q_reference = reference_;
     if (!t.adapt) {
         std::fill(problem_.clearance.begin(), problem_.clearance.end(),
@@ -213,7 +226,7 @@ void PathPlanner::swing(const Transition& t, Path& out) {
         slides = slides || (c.surface == t.made.surface && c.support == t.made.support);
     arc(p1, t.made.position, highest(support, p1, t.made.position), slides, ARC_POINTS,
         model_.length_scale, out.control);
-    ask_balance(t.held, {}, t.margin, 0.3);
+    ask_balance(t.held, {}, t.margin, SWING_POSTURE_WEIGHT);
     strained_ = false;
     for (const auto* q : {&t.shifted, &t.touching}) {
         strained_ = strained_ || look(t.held, q->data()).strain() > STRAINED;
@@ -223,6 +236,17 @@ void PathPlanner::swing(const Transition& t, Path& out) {
     reach.kind = TaskKind::Reaching;
     reach.edge = -1;
     problem_.tasks.push_back(reach);
+    made_rotation_ = reach.rotation;
+    problem_.over = true;
+    problem_.com_weight = SWING_COM_WEIGHT;
+    for (int k = 0; k < 2; ++k) {
+        solver.kin.update(k == 0 ? t.shifted.data() : t.touching.data());
+        com_[k] = solver.kin.com();
+        if (k == 0 && model_.surfaces[t.made.surface].flat)
+            turn_ = solver.kin.flat_error(t.made.surface, made_rotation_);
+        else if (k == 0)
+            turn_ = {};
+    }
     clearance_ = problem_.clearance;
     near_ends(t);
     std::vector<Contact> moving = t.rolling;

@@ -12,7 +12,6 @@ constexpr double CLEARANCE = 0.010;  // [m] p_safe: between links, and links and
 constexpr double FURTHER_CLEARANCE = 0.004;  // [m] a shin beside its knee
 constexpr double COM_WEIGHT = 0.3;       // of the middle of the polygon, while weight shifts
 constexpr double ELLIPSE_WEIGHT = 2.0;   // ... and of its ellipse (4.28)
-constexpr double ARC_WEIGHT = 40.0;      // of the arc, against posture 0.3 and constraints
 constexpr double DRIFT_LIMIT = 0.01;     // [m] of contacts, anywhere on the path
 constexpr double OVERLAP_LIMIT = 0.004;  // [m] of links, anywhere on the path
 
@@ -117,6 +116,9 @@ class PathPlanner {
     std::vector<double> tangent_, reference_, clearance_;
     std::vector<unsigned char> aloft_, low_;
     bool strained_ = false;  // a joint, at an end of the swing
+    Vec3 com_[2];            // at the ends of the swing
+    Vec3 turn_;              // of a sole in the swing, to `made_rotation_`
+    Quat made_rotation_;
     struct Eased {
         int pair;
         double distance;

@@ -176,7 +176,6 @@ void bind_posture(nb::module_& m) {
     m.attr("STEP_TOL") = STEP_TOL;
     m.attr("COM_WEIGHT") = COM_WEIGHT;
     m.attr("ELLIPSE_WEIGHT") = ELLIPSE_WEIGHT;
-    m.attr("ARC_WEIGHT") = ARC_WEIGHT;
     m.attr("DRIFT_LIMIT") = DRIFT_LIMIT;
     m.attr("OVERLAP_LIMIT") = OVERLAP_LIMIT;
     m.attr("PATH_OPENS") = static_cast<int>(Path::Status::Opens);

@@ -11,7 +11,7 @@ from clamber.errors import Status
 from clamber.model.world import World, limb_links
 from clamber.planning.trajectory import Trajectory, build_trajectory
 from clamber.step.ik import IK
-from clamber.step.path import ARC_WEIGHT, Phase
+from clamber.step.path import Phase
 from clamber.step.polygon import com_margin, support_polygon
 from clamber.step.stability import statics_at
 from clamber.step.tasks import reaching
@@ -20,6 +20,7 @@ from clamber.step.transition import balance_problem
 REACH = 0.12  # [m] a contact is probed for this far from where it was planned
 PROBE_SPEED = 0.06  # [m/s] along the normal
 PROBE_MARGIN = (0.01, 0.045)  # [m] of the centre of mass: what there is, within this
+WAY_WEIGHT = 40.0  # of the way along the normal, against posture 0.3
 DEPTHS = (0.006, 0.015, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, REACH)
 FOLLOWED = 0.010  # [m] of the normal that a posture may fall short of its node
 
@@ -118,7 +119,7 @@ def _node_below(
     """The posture near `q` with a contact at `wanted` (3,), and how far it is short."""
     world = ik.world
     support = world.supports[contact.support]
-    goal = reaching(world, contact, wanted, weight=ARC_WEIGHT)
+    goal = reaching(world, contact, wanted, weight=WAY_WEIGHT)
     problem = balance_problem(
         world,
         held=held,

@@ -25,7 +25,6 @@ from clamber.step.stability import limiting_joint
 from clamber.step.tasks import packed_contacts, packed_parts
 from clamber.step.transition import Transition
 
-ARC_WEIGHT: float = _core.ARC_WEIGHT  # of the arc, against posture 0.3 and constraints
 DRIFT_LIMIT: float = _core.DRIFT_LIMIT  # [m] of contacts, anywhere on the path
 OVERLAP_LIMIT: float = _core.OVERLAP_LIMIT  # [m] of links, anywhere on the path
 
