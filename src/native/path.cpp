@@ -25,6 +25,7 @@ constexpr double REACH_ANGLE = 25.0 * M_PI / 180.0;  // phi of (4.27)
 constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
 constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
 constexpr double STRAINED = 0.6;  // share of a torque: it may give way on the way, too
+constexpr double LEAST_ROOM = 0.020;  // [m] of the centre of mass, from what joints bear
 constexpr int MAX_BORDERS = 4;  // of torques, about the centre of mass of a posture
 
 // Contacts that stay closed in each phase: shift, swing, settle.
@@ -450,22 +451,20 @@ double PathPlanner::border() {
 bool PathPlanner::strengthen(const std::vector<Contact>& contacts, Solution& out) {
     if (!out.residuals.solved()) return false;
     const double margin = problem_.balance_margin;
-    bool holds = is_stable(contacts, out.q.data());
-    if (holds && holding_.has_room(margin)) return true;
+    if (look(contacts, out.q.data()).has_room(margin)) return true;
     double room = border();
     for (int i = 0; i < MAX_BORDERS && room < margin - MARGIN_TOL && room > -1.0; ++i) {
         const int iterations = out.iterations;
         solver.solve(problem_, out.q.data(), MAX_ITERATIONS, STEP_TOL, first_);
         if (!first_.residuals.solved()) break;
-        const bool stable = is_stable(contacts, first_.q.data());
+        look(contacts, first_.q.data());
         const double other = border();
         if (other <= room) break;
         std::swap(out, first_);
         out.iterations += iterations;
         room = other;
-        holds = stable;
     }
-    return holds;
+    return room >= LEAST_ROOM * model_.length_scale;
 }
 
 bool PathPlanner::shift(Transition& t, const double* hint, Solution& out) {
