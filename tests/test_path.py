@@ -199,7 +199,7 @@ def test_the_moving_surface_follows_its_arc(demo_plan, demo_kinematics):
             way.append(demo_kinematics.contact_point(made.surface, normal))
         off = [np.linalg.norm(swing.arc - p, axis=1).min() for p in way]
         assert np.median(off) < 0.05  # it cuts corners
-        assert np.array(way)[:, 2].max() > 0.7 * SAFE_HEIGHT + made.position[2]
+        assert np.array(way)[:, 2].max() > 0.6 * SAFE_HEIGHT + made.position[2]
 
 
 def test_the_centre_of_mass_does_not_turn_back_in_a_swing(demo_plan, demo_kinematics):
