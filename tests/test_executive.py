@@ -778,8 +778,10 @@ def test_a_limb_on_its_way_may_graze_an_edge(
     assert demo_plan.changes[0].step.makes.surface == "LHand"
     arm_on_box["name"] = f"{side}UpperArm"
     told = Told(demo_plan)
-    told.to(2000)
-    told.to(3000, share=0.8)
+    swing = next(s for s in demo_plan.trajectory.segments if s.kind == "swing")
+    third = (swing.end - swing.begin) // 3
+    told.to(swing.begin + third)
+    told.to(swing.end - third, share=0.8)
     assert kinds(told.events) == [Unintended] * (side == "R")
     if side == "R":
         assert told.events[0].support == "box"

@@ -470,7 +470,7 @@ def scaled_coman(folder: Path, scale: float) -> Path:
 def test_where_a_step_is_missed_other_weights_are_tried(
     coman, demo_sequence, monkeypatch
 ):
-    scene = at_distance(0.19, 0.42)
+    scene = at_distance(0.21, 0.42)
     varied = plan(demo_sequence, coman, scene)
     monkeypatch.setattr("clamber.planning.planner.VARIATIONS", ({},))
     once = plan(demo_sequence, coman, scene, contacts="demonstrated")

@@ -99,7 +99,7 @@ def test_an_arc_is_lower_over_an_obstacle():
 
 def test_a_small_robot_climbs_a_box_that_is_small_for_it_as_well(half, demo_sequence):
     scene, _ = beside_a_box(half, 0.5)
-    made = plan(demo_sequence, half, scene, contacts="demonstrated")
+    made = plan(demo_sequence, half, scene)
     assert made.complete, [str(f) for f in made.failures]
 
 
