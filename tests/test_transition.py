@@ -17,7 +17,7 @@ from clamber.step.ik import IK
 from clamber.step.path import Path
 from clamber.step.polygon import com_margin, support_ellipse, support_polygon
 from clamber.step.posture import KeyframeOptions
-from clamber.step.stability import equilibrium_at, statics_at
+from clamber.step.stability import LEAST_ROOM, equilibrium_at, is_stable, statics_at
 from clamber.step.transition import (
     MARGINS,
     approach_contact,
@@ -335,3 +335,21 @@ def test_a_contact_within_reach_is_approached_exactly(ik, demo_plan):
     near, solution = approach_contact(ik, before.stance, wanted, after.q)
     assert solution.status is Status.SOLVED
     assert np.linalg.norm(near.position - wanted.position) < 5e-3
+
+
+def test_a_posture_that_holds_without_room_is_no_shift(demo_plan, ik):
+    """Joints bear it as it stands, and not with its CoM 2 cm elsewhere."""
+    before, move = demo_plan.keyframes[4], demo_plan.changes[4].step
+    statuses = []
+    for share in np.linspace(0.6, 0.1, 51):
+        weak = IK(replace(ik.world, tau_max=share * ik.world.tau_max))
+        found = shifted(weak, before, move)
+        q, held = found.solution.q, found.held
+        weak.kin.update(q)
+        points, load, torque = statics_at(weak.kin, q, held)
+        room = _core.com_room(*points.arrays, load.com, load.mass, torque.arrays)
+        assert (found.status is Status.SOLVED) == (room >= LEAST_ROOM - 1e-6)
+        if room < LEAST_ROOM - 1e-6 and is_stable(weak.kin, q, held):
+            assert "20 mm to spare" in found.note
+            statuses.append(found.status)
+    assert set(statuses) == {Status.OVERLOADED}

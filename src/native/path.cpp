@@ -25,7 +25,6 @@ constexpr double REACH_ANGLE = 25.0 * M_PI / 180.0;  // phi of (4.27)
 constexpr double LEAN_WEIGHT = 0.5;                  // soft task (4.27)
 constexpr double STANCE_WEIGHT = 0.08;               // of the preferred posture
 constexpr double STRAINED = 0.6;  // share of a torque: it may give way on the way, too
-constexpr double LEAST_ROOM = 0.020;  // [m] of the centre of mass, from what joints bear
 constexpr int MAX_BORDERS = 4;  // of torques, about the centre of mass of a posture
 
 // Contacts that stay closed in each phase: shift, swing, settle.

@@ -12,6 +12,7 @@ constexpr double CLEARANCE = 0.010;  // [m] p_safe: between links, and links and
 constexpr double FURTHER_CLEARANCE = 0.004;  // [m] a shin beside its knee
 constexpr double COM_WEIGHT = 0.3;       // of the middle of the polygon, while weight shifts
 constexpr double ELLIPSE_WEIGHT = 2.0;   // ... and of its ellipse (4.28)
+constexpr double LEAST_ROOM = 0.020;     // [m] of the centre of mass, from what joints bear
 constexpr double DRIFT_LIMIT = 0.01;     // [m] of contacts, anywhere on the path
 constexpr double OVERLAP_LIMIT = 0.004;  // [m] of links, anywhere on the path
 

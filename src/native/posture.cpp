@@ -172,6 +172,7 @@ void bind_posture(nb::module_& m) {
     m.attr("CLEARANCE") = CLEARANCE;
     m.attr("FURTHER_CLEARANCE") = FURTHER_CLEARANCE;
     m.attr("EFFORT_SHARE") = EFFORT_SHARE;
+    m.attr("LEAST_ROOM") = LEAST_ROOM;
     m.attr("MAX_ITERATIONS") = MAX_ITERATIONS;
     m.attr("STEP_TOL") = STEP_TOL;
     m.attr("COM_WEIGHT") = COM_WEIGHT;

@@ -34,6 +34,9 @@ from clamber.step.statics import (
 from clamber.step.tasks import packed_contacts
 
 EFFORT_SHARE: float = _core.EFFORT_SHARE  # of the effort limits, for holding
+# [m] of the centre of mass of a shifted or touching posture, from what joints bear, of
+# the robot's size.
+LEAST_ROOM: float = _core.LEAST_ROOM
 MISSED = 0.001  # [m] a surface that stays as far from its support has not reached it
 STRETCHED = 0.99  # of a limb's length, from root to end
 AT_LIMIT = 0.01  # [rad] a joint that is nearer to its limit is at it
@@ -136,6 +139,12 @@ def limiting_joint(kin: Kinematics, q: np.ndarray, contacts: Sequence[Contact]) 
     if needed is None:
         return f"{Status.OVERLOADED.value}, however strong its joints"
     share, j = needed
+    if share <= 1.0:  # as it stands, but `LEAST_ROOM` is asked for
+        return (
+            f"{Status.OVERLOADED.value} with {1e3 * LEAST_ROOM:.0f} mm to spare for the"
+            f" centre of mass: {torque.names[j]} is near its limit of"
+            f" {float(kin.world.tau_max[j]):g} N m"
+        )
     counted = float(torque.limits[j])
     return (
         f"{Status.OVERLOADED.value}: {torque.names[j]} would need"
