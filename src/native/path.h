@@ -88,7 +88,7 @@ class PathPlanner {
                      const std::vector<Contact>& unloaded, double margin,
                      double posture_weight);
     // Moves the centre of mass to where joints are strong enough to keep its margin, too,
-    // or as near to that as is found. Whether the contacts hold the robot in the end.
+    // or as near to that as is found. Whether they hold it with `LEAST_ROOM` in the end.
     bool strengthen(const std::vector<Contact>& contacts, Solution& out);
     double border();
     void swing(const Transition& t, Path& out);

@@ -218,8 +218,8 @@ def _arms_and_legs(world: World) -> np.ndarray:
     for limb in world.robot.limbs.values():
         links[limb.is_arm] |= limb_links(world, limb.surfaces[0])
     bodies = world.model.geom_bodyid[world.pairs]
-    arms, legs = (np.isin(bodies, list(links[k])).any(axis=1) for k in (True, False))
-    return arms & legs
+    arms, legs = (np.isin(bodies, list(links[k])) for k in (True, False))
+    return np.logical_and(arms.any(axis=1), legs.any(axis=1))
 
 
 class IK:
