@@ -33,11 +33,11 @@ class Holding {
     // `BALANCE_TOL` where friction cones and torques that are counted on hold the robot.
     double residual();
     // Whether that holds with the centre of mass a distance from where it is, along each
-    // axis; and how far it may be in the worst direction, which is `outward`.
+    // axis; and how far it may be in the worst direction, which is `outward` (2).
     bool has_room(double distance);
-    // Of a joint that bears most, the share of what is counted on.
-    double strain();
     double room(double* outward);
+    // Of the joint that bears most, the share of what is counted on.
+    double strain();
     // (na) torques that balance what is looked at with the least contact forces; where these ask
     // more of a joint than is counted on, with those that do not. `price` of a force at
     // each contact, or none.
